@@ -1,7 +1,7 @@
 """Mitsuba runs on a good LLVM or says in one line what to install; a bad one never gets to abort the process.
 
-Each case is a process of its own, because a bad LLVM takes the process with it. `TWIN_LLVM_DIRS` stands in for
-"the library path of this machine": the program looks there and nowhere else.
+Each case is a process of its own, because a bad LLVM takes the process with it. `TWIN_LLVM_DIRS` stands in
+for "the library path of this machine": the program looks there and nowhere else.
 """
 
 import os

@@ -17,8 +17,8 @@ ALLOWED = {
     "fem": {"mumps", "numpy", "pydantic", "pyvista", "scipy", "skfem", "threadpoolctl"},
     "scenes": {"drjit", "mitsuba", "numpy", "OpenEXR", "pydantic", "pyvista", "scipy", "trimesh"},
     "twin": {"assets", "estimation", "fem", "scenes"}
-    | {"drjit", "matplotlib", "mitsuba", "mpl_toolkits", "numpy", "OpenEXR", "PIL", "pydantic", "pydantic_core"}
-    | {"pyvista", "rich", "scipy", "skfem", "torch", "trimesh"},
+    | {"drjit", "matplotlib", "mitsuba", "mpl_toolkits", "numpy", "OpenEXR", "PIL", "pydantic"}
+    | {"pydantic_core", "pyvista", "rich", "scipy", "skfem", "torch", "trimesh"},
 }
 MAX_LINES = 400
 
