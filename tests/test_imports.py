@@ -14,8 +14,8 @@ ROOMS = ("assets", "estimation", "fem", "scenes", "twin")
 ALLOWED = {
     "assets": set(),
     "estimation": {"numpy", "scipy", "torch"},
-    "fem": {"mumps", "numpy", "pydantic", "pyvista", "scipy", "skfem", "threadpoolctl"},
-    "scenes": {"drjit", "mitsuba", "numpy", "OpenEXR", "pydantic", "pyvista", "scipy", "trimesh"},
+    "fem": {"numpy", "pydantic", "pyvista", "scipy", "skfem", "threadpoolctl"},
+    "scenes": {"drjit", "mitsuba", "numpy", "OpenEXR", "PIL", "pydantic", "pyvista", "scipy", "trimesh"},
     "twin": {"assets", "estimation", "fem", "scenes"}
     | {"drjit", "matplotlib", "mitsuba", "mpl_toolkits", "numpy", "OpenEXR", "PIL", "pydantic"}
     | {"pydantic_core", "pyvista", "rich", "scipy", "skfem", "torch", "trimesh"},
