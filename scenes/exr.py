@@ -1,0 +1,204 @@
+"""Pictures on disk: OpenEXR for floats, PNG for counts. The same arrays give the same bytes.
+
+A file appears under its name only when all of it is on the disk (temporary name beside it, flush, fsync,
+rename), so a run that is cut off leaves the old file or none. EXR has no checksum of its own: who needs to
+know that nobody touched a pixel keeps the file's SHA-256.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import struct
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenEXR
+from numpy.typing import NDArray
+from PIL import Image
+
+StrPath = str | os.PathLike[str]
+
+# Attributes that describe the pixels themselves (OpenEXR technical introduction, "required attributes").
+_OWN = frozenset(
+    {"channels", "chunkCount", "compression", "dataWindow", "displayWindow", "lineOrder", "name"}
+    | {"pixelAspectRatio", "screenWindowCenter", "screenWindowWidth", "tiles", "type", "version"}
+)
+
+
+class ImageError(ValueError):
+    """A picture that cannot be written or read; one line naming the file and what is wrong."""
+
+
+def write_exr(
+    path: StrPath, channels: Mapping[str, NDArray[Any]], header: Mapping[str, str] | None = None
+) -> None:
+    """Write float32 planes, lossless (ZIP, blocks of 16 rows: readable everywhere).
+
+    Parameters
+    ----------
+    channels : name -> (rows, columns) float32
+        All of one shape; names such as ``led.0``, ``pressure``, ``displacement.z``.
+    header : name -> text
+        Kept beside the pixels; no dates are added.
+    """
+    path = Path(path)
+    if not channels:
+        raise ImageError(f"{path}: channels: received none, allowed: at least one")
+    planes: dict[str, NDArray[np.float32]] = {}
+    shape: tuple[int, ...] | None = None
+    for name, plane in channels.items():
+        array = np.asarray(plane)
+        shape = array.shape if shape is None else shape
+        if array.dtype != np.float32 or array.ndim != 2 or array.size == 0 or array.shape != shape:
+            raise ImageError(
+                f"{path}: channel {name}: received {array.dtype} {array.shape}, allowed: float32 "
+                "(rows, columns), one shape for all"
+            )
+        if not 1 <= len(name.encode()) <= 255 or "\0" in name:
+            raise ImageError(f"{path}: channel name: received {name!r}, allowed: 1 to 255 bytes")
+        planes[name] = np.ascontiguousarray(array)  # OpenEXR 3.5 ignores strides: pixels get scrambled
+    text = dict(header or {})
+    for key, value in text.items():
+        if key in _OWN or not key or not isinstance(value, str):
+            raise ImageError(f"{path}: header {key!r}: received {value!r}, allowed: text, under a free name")
+    attributes = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **text}
+    stream = io.BytesIO()
+    OpenEXR.File(attributes, planes, num_threads=0).write(stream)
+    write_bytes(path, stream.getvalue())
+
+
+def read_exr(path: StrPath) -> dict[str, NDArray[np.float32]]:
+    """The planes of an EXR file, name -> (rows, columns) float32, in alphabetical order of name.
+
+    Raises ImageError, in one line, for a file that is missing, not EXR, cut short or damaged.
+    """
+    data = _exr_bytes(Path(path))
+    try:
+        found = OpenEXR.File(io.BytesIO(data), separate_channels=True, num_threads=0).channels()
+    except (RuntimeError, ValueError) as error:
+        raise ImageError(f"{path}: damaged EXR file (pixels cannot be decoded)") from error
+    return {name: np.array(channel.pixels, dtype=np.float32) for name, channel in sorted(found.items())}
+
+
+def read_exr_header(path: StrPath) -> dict[str, str]:
+    """The text that `write_exr` kept beside the pixels."""
+    data = _exr_bytes(Path(path))
+    found = OpenEXR.File(io.BytesIO(data), header_only=True, num_threads=0).header()
+    return {key: value for key, value in sorted(found.items()) if key not in _OWN and isinstance(value, str)}
+
+
+def write_png(path: StrPath, image: NDArray[Any]) -> None:
+    """Write counts, (rows, columns) uint8 or uint16, as a grey PNG of 8 or 16 bits."""
+    array = np.asarray(image)
+    if array.dtype not in (np.uint8, np.uint16) or array.ndim != 2 or array.size == 0:
+        raise ImageError(
+            f"{path}: image: received {array.dtype} {array.shape}, allowed: uint8 or uint16, (rows, columns)"
+        )
+    stream = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(array)).save(stream, format="PNG", compress_level=6)
+    write_bytes(path, stream.getvalue())
+
+
+def read_png(path: StrPath) -> NDArray[Any]:
+    """Counts of a grey PNG, (rows, columns) uint8 or uint16.
+
+    Raises ImageError, in one line, for a file that is missing, cut short, not PNG or not grey.
+    """
+    data = _read(Path(path))
+    if not data.startswith(b"\x89PNG\r\n\x1a\n"):
+        raise ImageError(f"{path}: not a PNG file")
+    try:
+        with Image.open(io.BytesIO(data), formats=["PNG"]) as picture:
+            picture.load()
+            mode, array = picture.mode, np.array(picture)
+    # Pillow reports damage as SyntaxError, struct.error or OSError, depending on which chunk it hits.
+    except (OSError, SyntaxError, ValueError, struct.error, Image.DecompressionBombError) as error:
+        raise ImageError(f"{path}: damaged PNG file") from error
+    if mode == "L":
+        return array.astype(np.uint8)
+    if mode in ("I;16", "I;16B", "I"):
+        return array.astype(np.uint16)
+    raise ImageError(f"{path}: received a PNG of mode {mode}, allowed: grey of 8 or 16 bits")
+
+
+def write_bytes(path: StrPath, data: bytes) -> None:
+    """Put bytes under a name all at once: readers see the old file or the new one, never a part."""
+    path = Path(path)
+    try:
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+    except OSError as error:
+        raise ImageError(f"{path}: cannot be written ({error.strerror})") from error
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.chmod(temporary, 0o666 & ~_umask())  # mkstemp makes it private; give what open() would have given
+        os.replace(temporary, path)
+    except BaseException as error:
+        Path(temporary).unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise ImageError(f"{path}: cannot be written ({error.strerror})") from error
+        raise
+
+
+def _umask() -> int:
+    mask = os.umask(0o077)  # there is no call that only asks
+    os.umask(mask)
+    return mask
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise ImageError(f"{path}: cannot be read ({error.strerror})") from error
+
+
+def _exr_bytes(path: Path) -> bytes:
+    """The bytes of a single-part scan-line EXR file, after a look at its table of blocks.
+
+    OpenEXR itself prints to the terminal when a file is cut short; asking first keeps the message to
+    one line.
+    Layout: OpenEXR file layout, "offset tables" and "scan line blocks".
+    """
+    data = _read(path)
+    if not data.startswith(b"\x76\x2f\x31\x01"):
+        raise ImageError(f"{path}: not an EXR file")
+    try:
+        (version,) = struct.unpack_from("<i", data, 4)
+        if version & ~0xFF & ~0x400:  # any flag but "long names": tiles, deep pixels, several parts
+            raise ImageError(f"{path}: received a tiled, deep or multi-part EXR, allowed: one scan-line part")
+        at, rows, block = 8, 0, 0
+        while data[at] != 0:
+            name, at = _text(data, at)
+            _, at = _text(data, at)
+            (size,) = struct.unpack_from("<i", data, at)
+            at += 4
+            if name == b"dataWindow":
+                _, low, _, high = struct.unpack_from("<4i", data, at)
+                rows = high - low + 1
+            elif name == b"compression":
+                block = {0: 1, 1: 1, 2: 1, 3: 16, 4: 32, 5: 16, 6: 32, 7: 32, 8: 32, 9: 256}.get(data[at], 0)
+            at += size
+        at += 1
+        if rows < 1 or block < 1:
+            raise ImageError(f"{path}: damaged EXR file (header without size or known compression)")
+        for offset in struct.unpack_from(f"<{-(-rows // block)}Q", data, at):
+            _, size = struct.unpack_from("<ii", data, offset)
+            if size < 0 or offset + 8 + size > len(data):
+                raise ImageError(f"{path}: EXR file is cut short ({len(data)} bytes)")
+    except (IndexError, struct.error, OverflowError) as error:
+        raise ImageError(f"{path}: EXR file is cut short or damaged ({len(data)} bytes)") from error
+    return data
+
+
+def _text(data: bytes, at: int) -> tuple[bytes, int]:
+    end = data.find(b"\0", at, at + 256)
+    if end < 0:
+        raise IndexError(at)
+    return data[at:end], end + 1

@@ -1,0 +1,276 @@
+"""The sensor as light sees it: guide, glass, LEDs, camera, skin and tissue (no Mitsuba here).
+
+Frame: the origin is the centre of the undeformed contact surface and +z points into the specimen, so the
+guide fills ``-thickness_mm <= z <= 0``, the glass lies below it and the camera's pinhole below the glass.
+Lengths are mm, air gaps µm, wavelengths nm. Every class checks its own values; `Sensor` also checks them
+against each other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Annotated, Literal, NamedTuple
+
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+RefractiveIndex = Annotated[float, Field(ge=1.0, le=4.0)]
+Positive = Annotated[float, Field(gt=0.0)]
+Side = Literal["+x", "-x", "+y", "-y"]
+Coupling = Literal["air", "embedded"]
+
+
+class Conflict(NamedTuple):
+    """A value that does not fit the others: dotted field, what it holds, what would be allowed."""
+
+    field: str
+    received: object
+    allowed: str
+
+
+@dataclass(frozen=True, config=CONFIG)
+class Guide:
+    """The waveguide as light sees it: a square block of elastomer with one index through all its layers."""
+
+    width_mm: Annotated[Positive, Field(description="Side of the square contact surface, mm.")]
+    thickness_mm: Annotated[Positive, Field(description="Thickness from contact surface to glass, mm.")]
+    refractive_index: Annotated[
+        RefractiveIndex, Field(description="Refractive index of the guide at the light's wavelength.")
+    ] = 1.4336
+
+
+@dataclass(frozen=True, config=CONFIG)
+class Glass:
+    """The rigid plate between the guide and the camera, as wide as the guide."""
+
+    thickness_mm: Annotated[Positive, Field(description="Thickness of the plate, mm.")] = 2.0
+    refractive_index: Annotated[
+        RefractiveIndex, Field(description="Refractive index of the plate at the light's wavelength.")
+    ] = 1.515
+
+
+@dataclass(frozen=True, config=CONFIG)
+class Led:
+    """One LED at a side face of the guide: a Lambertian disc that faces the guide's middle."""
+
+    side: Annotated[Side, Field(description="Side face of the guide that the LED sits at: +x, -x, +y or -y.")]
+    along_mm: Annotated[
+        float,
+        Field(description="Place of the LED's centre along that side, from the middle of the side, mm."),
+    ] = 0.0
+    z_mm: Annotated[
+        float,
+        Field(
+            lt=0.0,
+            description="Height of the LED's centre, mm; 0 is the contact surface, negative is below it.",
+        ),
+    ] = -5.0
+    diameter_mm: Annotated[Positive, Field(description="Diameter of the emitting disc, mm.")] = 1.5
+    flux_W: Annotated[float, Field(ge=0.0, description="Radiant flux of the LED, W (0 is a failed LED).")] = (
+        0.010
+    )
+    coupling: Annotated[
+        Coupling,
+        Field(
+            description="'air': outside, through the flat side face; 'embedded': inside the guide, "
+            "which leaks light through the contact surface and shows hot spots."
+        ),
+    ] = "air"
+    gap_mm: Annotated[
+        float,
+        Field(
+            gt=0.0,
+            description="Distance of the disc from the side face, mm: outside (air) or inside (embedded).",
+        ),
+    ] = 0.5
+
+
+@dataclass(frozen=True, config=CONFIG)
+class Camera:
+    """The camera below the glass: a pinhole at a distance, and a sensor with EMVA 1288 noise."""
+
+    columns: Annotated[int, Field(ge=1, le=16384, description="Pixels along x.")]
+    rows: Annotated[int, Field(ge=1, le=16384, description="Pixels along y.")]
+    pixel_um: Annotated[
+        tuple[Positive, Positive],
+        Field(description="Width (x) and height (y) of one pixel on the sensor, µm."),
+    ]
+    field_of_view_mm: Annotated[
+        Positive,
+        Field(description="Width (x) of the part of the contact surface that fills the picture, mm."),
+    ]
+    distance_mm: Annotated[
+        Positive,
+        Field(description="Distance of the pinhole (entrance pupil) below the glass's lower face, mm."),
+    ] = 40.0
+    f_number: Annotated[
+        Positive, Field(description="f-number of the lens: focal length over entrance pupil.")
+    ] = 4.0
+    exposure_ms: Annotated[
+        Positive, Field(description="Exposure time of one frame, ms; fixed, never chosen per picture.")
+    ] = 10.0
+    quantum_efficiency: Annotated[
+        float, Field(gt=0.0, le=1.0, description="Electrons per photon at the light's wavelength, 0 to 1.")
+    ] = 0.5
+    full_well_e: Annotated[Positive, Field(description="Electrons at which a pixel saturates.")] = 45_000.0
+    read_noise_e: Annotated[
+        float, Field(ge=0.0, description="Standard deviation of the read noise, electrons.")
+    ] = 12.0
+    dark_current_e_s: Annotated[
+        float, Field(ge=0.0, description="Dark current of one pixel, electrons per second.")
+    ] = 20.0
+    prnu_percent: Annotated[
+        float,
+        Field(ge=0.0, le=100.0, description="Photo-response non-uniformity (spread of the pixels' gain), %."),
+    ] = 1.0
+    dsnu_e: Annotated[
+        float,
+        Field(ge=0.0, description="Dark-signal non-uniformity (spread of the pixels' offset), electrons."),
+    ] = 10.0
+    gain_e_per_dn: Annotated[Positive, Field(description="Electrons per digital count.")] = 45_000.0 / 255.0
+    offset_dn: Annotated[
+        float, Field(ge=0.0, description="Counts of a pixel without signal (black level).")
+    ] = 4.0
+    bits: Annotated[int, Field(ge=8, le=16, description="Bits of one pixel's count: 8 to 16.")] = 8
+    pattern_seed: Annotated[
+        int,
+        Field(
+            ge=0,
+            lt=2**63,
+            description="Seed of the camera's own fixed pattern (PRNU and DSNU): one number, one camera.",
+        ),
+    ] = 1
+
+    @property
+    def field_height_mm(self) -> float:
+        """Height (y) of the part of the contact surface that fills the picture, mm."""
+        sensor_width, sensor_height = self.columns * self.pixel_um[0], self.rows * self.pixel_um[1]
+        return self.field_of_view_mm * sensor_height / sensor_width
+
+
+@dataclass(frozen=True, config=CONFIG)
+class Skin:
+    """Rough contact between guide and tissue: how pressure turns into real contact and air gaps."""
+
+    rms_slope: Annotated[
+        Positive, Field(description="Root-mean-square slope h' of the tissue's surface, without unit.")
+    ] = 2.0
+    rms_height_um: Annotated[
+        Positive,
+        Field(
+            description="Root-mean-square height of the tissue's surface, µm; sets the gaps outside contact."
+        ),
+    ] = 10.0
+    kappa: Annotated[
+        float,
+        Field(
+            ge=1.0,
+            le=4.0,
+            description="Factor of the contact law: 1.6 (Persson) to 2.5 (Bush, Gibson and Thomas).",
+        ),
+    ] = 1.6
+    gap_index: Annotated[
+        float,
+        Field(
+            ge=1.0, le=4.0, description="Refractive index of what fills the gaps: 1 for air, 1.33 for water."
+        ),
+    ] = 1.0
+
+
+@dataclass(frozen=True, config=CONFIG)
+class Tissue:
+    """The specimen's surface, as light sees it."""
+
+    refractive_index: Annotated[RefractiveIndex, Field(description="Refractive index of the specimen.")] = (
+        1.40
+    )
+    albedo: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            lt=1.0,
+            description="Share of the light that enters the specimen and comes back out, 0 to 1.",
+        ),
+    ] = 0.68
+
+
+@dataclass(frozen=True, config=CONFIG)
+class Sensor:
+    """All that the optics need to know, checked as a whole."""
+
+    guide: Annotated[Guide, Field(description="The waveguide.")]
+    glass: Annotated[Glass, Field(description="The plate between guide and camera.")]
+    leds: Annotated[tuple[Led, ...], Field(min_length=1, description="The light sources.")]
+    camera: Annotated[Camera, Field(description="The camera below the glass.")]
+    skin: Annotated[Skin, Field(description="Rough contact between guide and tissue.")]
+    tissue: Annotated[Tissue, Field(description="The specimen's optics.")]
+    effective_modulus_kPa: Annotated[
+        Positive,
+        Field(description="Contact modulus E*, 1/E* = sum of (1 - nu²)/E over guide and tissue, kPa."),
+    ]
+    wavelength_nm: Annotated[
+        float, Field(ge=350.0, le=1100.0, description="Wavelength of the light, nm.")
+    ] = 550.0
+
+    def __post_init__(self) -> None:
+        for conflict in conflicts(self.guide, self.leds, self.camera, self.skin):
+            raise ValueError(f"{conflict.field}: received {conflict.received!r}; allowed {conflict.allowed}")
+
+
+def conflicts(guide: Guide, leds: tuple[Led, ...], camera: Camera, skin: Skin) -> Iterator[Conflict]:
+    """Yield every value that does not fit the others, in the order of the arguments.
+
+    The fields are named ``leds.0.z_mm``, ``camera.field_of_view_mm``, ``skin.gap_index`` and so on.
+    """
+    for number, led in enumerate(leds):
+        yield from _led_conflicts(f"leds.{number}", led, guide)
+    fields = {"width": camera.field_of_view_mm, "height": camera.field_height_mm}
+    for name, extent in fields.items():
+        if extent > guide.width_mm * (1 + 1e-9):
+            yield Conflict(
+                "camera.field_of_view_mm",
+                camera.field_of_view_mm,
+                f"a field whose {name} ({extent:.4g} mm) stays within the guide's {guide.width_mm:g} mm",
+            )
+            break
+    if camera.offset_dn >= 2**camera.bits - 1:
+        yield Conflict(
+            "camera.offset_dn",
+            camera.offset_dn,
+            f"a number below the {2**camera.bits - 1} counts of {camera.bits} bits",
+        )
+    if skin.gap_index >= guide.refractive_index:
+        yield Conflict(
+            "skin.gap_index",
+            skin.gap_index,
+            f"a number below the guide's index {guide.refractive_index:g} (else no light is trapped)",
+        )
+
+
+def _led_conflicts(path: str, led: Led, guide: Guide) -> Iterator[Conflict]:
+    """The emitting disc must lie on its side face, and an embedded one in its own half of the guide."""
+    radius, width, thickness = led.diameter_mm / 2, guide.width_mm, guide.thickness_mm
+    if led.diameter_mm > min(width, thickness):
+        yield Conflict(
+            f"{path}.diameter_mm", led.diameter_mm, f"at most the side face of {width:g} x {thickness:g} mm"
+        )
+        return
+    reach = width / 2 - radius
+    if abs(led.along_mm) > reach:
+        yield Conflict(
+            f"{path}.along_mm",
+            led.along_mm,
+            f"-{reach:g} to {reach:g} mm (the disc stays on the guide's side)",
+        )
+    if not radius - thickness <= led.z_mm <= -radius:
+        yield Conflict(
+            f"{path}.z_mm",
+            led.z_mm,
+            f"{radius - thickness:g} to {-radius:g} mm (the disc stays on the guide's side)",
+        )
+    if led.coupling == "embedded" and led.gap_mm >= width / 2:
+        yield Conflict(
+            f"{path}.gap_mm", led.gap_mm, f"less than {width / 2:g} mm (half the guide) for an embedded LED"
+        )

@@ -1,0 +1,187 @@
+"""What the command line accepts: flags, their units, and one plain line for what it does not."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+import sys
+from collections.abc import Callable
+from typing import Any, NoReturn
+
+from twin.complaint import shown
+from twin.simulate import Device, Quality
+
+QUALITIES = Quality.__args__  # type: ignore[attr-defined]
+DEVICES = Device.__args__  # type: ignore[attr-defined]
+
+_DEMO = """\
+Press the paper's sensor 2 mm into a slab with an inclusion of Table I (number 9: 10 mm across, its top
+5 mm deep, 100 kPa) and write the picture, the fields behind it and a page to look at, overview.png.
+
+example:
+  twin demo --out tsis-demo
+"""
+
+_SIMULATE = """\
+Press a sensor on a slab of tissue and write the picture that its camera takes: one frame, or one for each
+press level in OUT/00, OUT/01, ... Lengths are mm, moduli kPa, forces N.
+
+examples:
+  twin simulate --size 10 --depth 5 --modulus 100 --out out
+  twin simulate tsis --size 8 --depth 5 --modulus 120 --indentation 1 2 3 --seed 7 --out levels
+  twin simulate my-sensor.toml --no-inclusion --force 0.5 --out flat
+"""
+
+_SCHEMA = """\
+Print the JSON schema of a design file. An editor that knows it completes and checks designs.
+
+example:
+  twin schema > schema.json     and in the design's first line:  #:schema ./schema.json
+"""
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser that answers a mistake with one line and exit status 2."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: {_plain(message)}\n")
+
+
+def parse(argv: list[str] | None) -> argparse.Namespace:
+    """Return the arguments, or leave with status 2 and one line on stderr."""
+    return _parser().parse_args(sys.argv[1:] if argv is None else argv)
+
+
+def _parser() -> Parser:
+    parser = Parser(
+        prog="twin",
+        description="Digital twin of the tactile sensation imaging system: from press to picture.",
+        epilog="Start with: twin demo",
+        allow_abbrev=False,
+    )
+    parser.add_argument("--version", action="store_true", help="print the version and stop")
+    verbs = parser.add_subparsers(dest="verb", metavar="VERB", title="verbs")
+
+    demo = _verb(verbs, "demo", "the main job on the shipped design and an inclusion of the paper", _DEMO)
+    _add_run_flags(demo, out="tsis-demo")
+
+    simulate = _verb(verbs, "simulate", "one picture, or one per press level", _SIMULATE)
+    simulate.add_argument(
+        "design", metavar="DESIGN", nargs="?", default="tsis", help="name or TOML file (default tsis)"
+    )
+    above_zero = number(above=0.0)
+    simulate.add_argument("--size", type=above_zero, metavar="MM", help="diameter of the inclusion")
+    simulate.add_argument("--depth", type=above_zero, metavar="MM", help="depth of the inclusion's top")
+    simulate.add_argument("--modulus", type=above_zero, metavar="KPA", help="its Young's modulus")
+    simulate.add_argument(
+        "--offset",
+        type=number(),
+        nargs=2,
+        metavar=("X", "Y"),
+        help="inclusion minus probe centre, mm (default 0 0)",
+    )
+    simulate.add_argument("--no-inclusion", action="store_true", help="homogeneous tissue")
+    press = simulate.add_mutually_exclusive_group()
+    press.add_argument(
+        "--indentation", type=above_zero, nargs="+", metavar="MM", help="press depths (default: the design's)"
+    )
+    press.add_argument(
+        "--force", type=above_zero, nargs="+", metavar="N", help="press forces instead of depths"
+    )
+    _add_run_flags(simulate)
+
+    _verb(verbs, "schema", "the JSON schema of a design file", _SCHEMA)
+    return parser
+
+
+def _verb(verbs: Any, name: str, summary: str, text: str) -> Parser:
+    verb: Parser = verbs.add_parser(
+        name,
+        help=summary,
+        description=text,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    return verb
+
+
+def _add_run_flags(parser: Parser, out: str | None = None) -> None:
+    default = "" if out is None else f" (default {out})"
+    parser.add_argument("--out", metavar="DIR", default=out, help="new folder for the results" + default)
+    parser.add_argument(
+        "--quality",
+        type=choice(*QUALITIES),
+        default="standard",
+        metavar="Q",
+        help=", ".join(QUALITIES) + " (default standard)",
+    )
+    parser.add_argument(
+        "--seed", type=whole, default=0, metavar="N", help="of all random numbers (default 0)"
+    )
+    parser.add_argument(
+        "--device",
+        type=choice(*DEVICES),
+        default="auto",
+        metavar="D",
+        help=", ".join(DEVICES) + " (default auto)",
+    )
+
+
+def number(*, above: float = -math.inf) -> Callable[[str], float]:
+    """Return a reader of finite numbers, for argparse."""
+    allowed = "a finite number" if above == -math.inf else f"a finite number > {above:g}"
+
+    def read(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not above < value < math.inf:
+            raise argparse.ArgumentTypeError(f"received {shown(text)}; allowed {allowed}")
+        return value
+
+    return read
+
+
+def whole(text: str) -> int:
+    """Read an integer from 0 to 2**63 - 1, for argparse."""
+    if not re.fullmatch(r"[0-9]{1,19}", text) or int(text) >= 2**63:
+        raise argparse.ArgumentTypeError(f"received {shown(text)}; allowed an integer from 0 to 2**63 - 1")
+    return int(text)
+
+
+def choice(*choices: str) -> Callable[[str], str]:
+    """Return a reader of one of several words, for argparse."""
+
+    def read(text: str) -> str:
+        if text not in choices:
+            words = ", ".join(choices)
+            raise argparse.ArgumentTypeError(f"received {shown(text)}; allowed one of {words}")
+        return text
+
+    return read
+
+
+_REWORDED = (
+    (r"argument (\S+): (received .*)", r"\1: \2"),
+    (r"argument (\S+): invalid choice: (.*) \(choose from (.*)\)", r"\1: received \2; allowed one of \3"),
+    (r"argument (\S+): expected one argument", r"\1: received no value; allowed one"),
+    (r"argument (\S+): expected at least one argument", r"\1: received no value; allowed one or more"),
+    (r"argument (\S+): expected (\d+) arguments", r"\1: received another number of values; allowed \2"),
+    (
+        r"argument (\S+): not allowed with argument (\S+)",
+        r"\1: received together with \2; allowed one of them",
+    ),
+    (r"unrecognized arguments: (.*)", r"received what it does not know: \1; allowed what --help lists"),
+)
+
+
+def _plain(message: str) -> str:
+    """Return one of argparse's messages in this program's words."""
+    message = " ".join(message.split())
+    for pattern, words in _REWORDED:
+        found = re.fullmatch(pattern, message)
+        if found:
+            return found.expand(words)
+    return message

@@ -1,0 +1,150 @@
+"""The command line: ``twin demo``, ``twin simulate``, ``twin schema``.
+
+Exit status 0: done; 1: the machine failed (a full disk); 2: bad input, one line on stderr; 130: interrupted.
+Nothing slow is imported until the input has been checked.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import NoReturn
+
+import fem
+from scenes.backend import BackendError
+from twin.arguments import parse
+from twin.complaint import DesignError
+from twin.design import Design, design_schema, load_design
+from twin.frame import fill, holds_frames, versions
+from twin.simulate import Options, check, simulate
+from twin.stage import staged
+
+DEMO_INCLUSION = fem.Inclusion(size=10.0, depth=5.0, modulus=100.0)
+"""Table I, number 9: clear in the picture, in the middle of the paper's range."""
+
+# The dotted names of values that were given as flags.
+_FLAGS = {
+    "inclusion.size": "--size",
+    "inclusion.depth": "--depth",
+    "inclusion.modulus": "--modulus",
+    "inclusion.offset": "--offset",
+    "press.indentation_mm": "--indentation",
+    "press.force_N": "--force",
+    "out": "--out",
+    "device": "--device",
+}
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command line and return its exit status."""
+    try:
+        arguments = parse(argv)
+    except SystemExit as stop:  # argparse leaves this way, for --help too
+        return int(stop.code or 0)
+    name = f"twin {arguments.verb}" if arguments.verb else "twin"
+    try:
+        with _termination_as_interrupt():
+            return _run(arguments)
+    except (DesignError, fem.NotModelled, BackendError) as error:
+        return _fail(name, _with_flags(str(error)), 2)
+    except KeyboardInterrupt:
+        return _fail(name, "interrupted; nothing was written", 130)
+    except BrokenPipeError:  # `twin schema | head`
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115 (Python flushes it on its way out)
+        return 0
+    except OSError as error:
+        return _fail(name, f"nothing was written: {error}", 1)
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    if arguments.version:
+        print(f"twin {versions()['tsis-twin']}")
+    elif arguments.verb == "schema":
+        print(json.dumps(design_schema(), indent=2, ensure_ascii=False), flush=True)
+    elif arguments.verb == "demo":
+        design = load_design("tsis")
+        _simulate(arguments, design, DEMO_INCLUSION, design.press.indentation_mm)
+    elif arguments.verb == "simulate":
+        design = load_design(arguments.design)
+        inclusion = _inclusion(arguments)
+        levels = arguments.force or arguments.indentation or design.press.indentation_mm
+        _simulate(arguments, design, inclusion, levels, by_force=bool(arguments.force))
+    else:
+        parse(["--help"])
+    return 0
+
+
+def _simulate(
+    arguments: argparse.Namespace,
+    design: Design,
+    inclusion: fem.Inclusion | None,
+    levels: Sequence[float],
+    by_force: bool = False,
+) -> None:
+    if arguments.out is None:
+        raise DesignError("out", "nothing", "the folder to make for the results")
+    check(design, inclusion, levels, by_force=by_force)
+    from twin.reporting import Reporter, summarise
+
+    with staged(arguments.out, holds_frames) as folder, Reporter() as report:
+        options = Options(
+            quality=arguments.quality, seed=arguments.seed, device=arguments.device, progress=report
+        )
+        if by_force:
+            frames = simulate(design, inclusion, force=levels, **options)
+        else:
+            frames = simulate(design, inclusion, levels, **options)
+        report("files", 0.95)
+        fill(frames, folder)
+    summarise(frames, Path(arguments.out))
+
+
+def _inclusion(arguments: argparse.Namespace) -> fem.Inclusion | None:
+    given = {name: getattr(arguments, name) for name in ("size", "depth", "modulus")}
+    for name, value in {**given, "offset": arguments.offset}.items():
+        if arguments.no_inclusion and value is not None:
+            raise DesignError(f"--{name}", "it together with --no-inclusion", "one of them")
+        if not arguments.no_inclusion and value is None and name in given:
+            raise DesignError(f"--{name}", "nothing", "a finite number > 0 (or --no-inclusion)")
+    if arguments.no_inclusion:
+        return None
+    return fem.Inclusion(**given, offset=tuple(arguments.offset or (0.0, 0.0)))
+
+
+def _with_flags(line: str) -> str:
+    field, colon, rest = line.partition(":")
+    return _FLAGS.get(field, field) + colon + rest
+
+
+def _fail(name: str, line: str, status: int) -> int:
+    print(f"{name}: {' '.join(line.split())}", file=sys.stderr)
+    return status
+
+
+@contextmanager
+def _termination_as_interrupt() -> Iterator[None]:
+    """Treat a request to terminate as Ctrl-C within the block, so that nothing half-written stays."""
+
+    def interrupt(number: int, frame: FrameType | None) -> NoReturn:
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread():  # signals do not arrive here anyway
+        yield
+        return
+    earlier = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, earlier)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,173 @@
+"""One plain line for whatever is wrong with a value: where it stands, what was received, what is allowed.
+
+pydantic finds the mistakes; this file says them in words a sensor designer uses. What is allowed is read
+from the JSON schema of the model that refused the value, so that a bound is written down once, on the
+field.
+"""
+
+from __future__ import annotations
+
+import math
+import reprlib
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from pydantic import ValidationError
+from pydantic_core import ErrorDetails
+
+Location = tuple[str | int, ...]
+
+_NOTHING = object()
+_shorten = reprlib.Repr()
+_shorten.maxstring = _shorten.maxother = 60
+_shorten.maxlist = _shorten.maxtuple = _shorten.maxdict = 4
+
+
+class DesignError(ValueError):
+    """A value that cannot be: of a design, an inclusion or a press. Its text is one line.
+
+    ``field`` is the dotted name, ``received`` the value as text, ``allowed`` what would do, ``source`` the
+    file (or "") and ``more`` how many other mistakes were found beside this one.
+    """
+
+    def __init__(self, field: str, received: str, allowed: str, *, source: str = "", more: int = 0) -> None:
+        self.field, self.received, self.allowed, self.source, self.more = (
+            field,
+            received,
+            allowed,
+            source,
+            more,
+        )
+        where = f"{source}: {field}" if source else field
+        text = f"{where}: received {received}; allowed {allowed}" + (f" (+{more} more)" if more else "")
+        super().__init__(" ".join(text.split()))
+
+    def renamed(self, field: str | None = None, *, source: str | None = None) -> DesignError:
+        """Return the same complaint about another name of the field, or as found in a file."""
+        return DesignError(
+            self.field if field is None else field,
+            self.received,
+            self.allowed,
+            source=self.source if source is None else source,
+            more=self.more,
+        )
+
+
+def shown(value: object) -> str:
+    """Return a value as a person would have written it, shortened to fit a line."""
+    return _shorten.repr(value)
+
+
+def from_validation(error: ValidationError, data: object, schema: Mapping[str, Any]) -> DesignError:
+    """Return pydantic's first error as a `DesignError`, counting the others.
+
+    ``data`` is what was validated (nested dicts and lists) and ``schema`` the JSON schema of the model.
+    """
+    errors = error.errors(include_url=False)
+    first, more = errors[0], len(errors) - 1
+    cause = first.get("ctx", {}).get("error")
+    if isinstance(cause, DesignError):
+        return DesignError(cause.field, cause.received, cause.allowed, more=cause.more + more)
+    field, received, allowed = _words(first, data, schema)
+    return DesignError(field, received, allowed, more=more)
+
+
+def not_finite(data: object, schema: Mapping[str, Any], location: Location = ()) -> Iterator[DesignError]:
+    """Yield a complaint for every NaN or infinity in nested dicts and lists."""
+    if isinstance(data, Mapping):
+        for key, value in data.items():
+            yield from not_finite(value, schema, (*location, key))
+    elif isinstance(data, Sequence) and not isinstance(data, str):
+        for index, value in enumerate(data):
+            yield from not_finite(value, schema, (*location, index))
+    elif isinstance(data, float) and not math.isfinite(data):
+        allowed = describe(schema, location).replace("a number", "a finite number")
+        yield DesignError(dotted(location), shown(data), allowed)
+
+
+def dotted(location: Location) -> str:
+    """Return ``("leds", 0, "z_mm")`` as ``leds.0.z_mm``."""
+    return ".".join(str(step) for step in location) or "the file"
+
+
+def describe(schema: Mapping[str, Any], location: Location) -> str:
+    """Return in words what the schema allows at a location, such as ``a number > 0 and <= 1``."""
+    node: Mapping[str, Any] | None = schema
+    for step in location:
+        node = _child(schema, node, step)
+    return _in_words(schema, node)
+
+
+def _words(error: ErrorDetails, data: object, schema: Mapping[str, Any]) -> tuple[str, str, str]:
+    location: Location = tuple(error["loc"])
+    value = _value(data, location)
+    received = "nothing" if value is _NOTHING else shown(value)
+    match error["type"]:
+        case "unexpected_keyword_argument" | "extra_forbidden":
+            parent = _node(schema, location[:-1])
+            names = ", ".join(parent.get("properties", {}))
+            return dotted(location), f"the unknown key {location[-1]!r} = {received}", f"one of {names}"
+        case "value_error":
+            return dotted(location), received, str(error.get("ctx", {}).get("error", error["msg"]))
+        case _:
+            return dotted(location), received, describe(schema, location)
+
+
+def _value(data: object, location: Location) -> object:
+    for step in location:
+        try:
+            data = data[step]  # type: ignore[index]
+        except (KeyError, IndexError, TypeError):
+            return _NOTHING
+    return data
+
+
+def _node(schema: Mapping[str, Any], location: Location) -> Mapping[str, Any]:
+    node: Mapping[str, Any] | None = schema
+    for step in location:
+        node = _child(schema, node, step)
+    return _resolved(schema, node)
+
+
+def _resolved(schema: Mapping[str, Any], node: Mapping[str, Any] | None) -> Mapping[str, Any]:
+    while node is not None and "$ref" in node:
+        node = schema["$defs"][node["$ref"].rsplit("/", 1)[-1]]
+    return node or {}
+
+
+def _child(
+    schema: Mapping[str, Any], node: Mapping[str, Any] | None, step: str | int
+) -> Mapping[str, Any] | None:
+    node = _resolved(schema, node)
+    if isinstance(step, int):
+        fixed = node.get("prefixItems", [])
+        return fixed[step] if step < len(fixed) else node.get("items")
+    return node.get("properties", {}).get(step)
+
+
+_BOUNDS = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}
+
+
+def _in_words(schema: Mapping[str, Any], node: Mapping[str, Any] | None) -> str:
+    node = _resolved(schema, node)
+    if "enum" in node:
+        return "one of " + ", ".join(repr(choice) for choice in node["enum"])
+    match node.get("type"):
+        case "number" | "integer" as kind:
+            bounds = [f"{sign} {node[key]:g}" for key, sign in _BOUNDS.items() if key in node]
+            return " ".join(["a number" if kind == "number" else "an integer", " and ".join(bounds)]).strip()
+        case "string":
+            return "a text in quotes"
+        case "array":
+            return _list_in_words(schema, node)
+        case "object":
+            return "a table with the keys " + ", ".join(node.get("properties", {}))
+    return "a value of another type"
+
+
+def _list_in_words(schema: Mapping[str, Any], node: Mapping[str, Any]) -> str:
+    fixed, least, most = node.get("prefixItems"), node.get("minItems"), node.get("maxItems")
+    if fixed:
+        return f"a list of {len(fixed)}, each {_in_words(schema, fixed[0])}"
+    count = f" of {least} or more" if least and most is None else f" of {least} to {most}" if most else ""
+    return f"a list{count}, each {_in_words(schema, node.get('items'))}"

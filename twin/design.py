@@ -1,0 +1,291 @@
+"""A design: the sensor, the specimen and the press, as a frozen, checked value read from a TOML file.
+
+The sections of the file compose the dataclasses of the rooms: `fem.Layer` and `Glass`, `Led`, `Camera`,
+`Skin` of `scenes.sensor` stand in it as they are; `Design.probe`, `Design.slab` and `Design.sensor` hand
+each room its own input. Lengths are mm, moduli kPa, wavelengths nm; the frame is that of `scenes.sensor`.
+"""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Iterator
+from importlib.resources import files
+from importlib.resources.abc import Traversable
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass
+from pydantic.json_schema import GenerateJsonSchema
+
+import fem
+from scenes.sensor import Camera, Glass, Guide, Led, RefractiveIndex, Sensor, Skin, Tissue, conflicts
+from twin.complaint import DesignError, from_validation, not_finite, shown
+
+CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+MAX_STRAIN = 0.2
+"""Deepest press, as a share of the slab's thickness: at 6 mm into 30 mm finite strain changes it by 36 %;
+beyond that nothing here has been compared with an independent code."""
+
+Positive = Annotated[float, Field(gt=0.0)]
+PoissonRatio = Annotated[float, Field(ge=0.0, le=0.4999)]
+
+
+@dataclass(frozen=True, config=CONFIG)
+class Waveguide:
+    """The waveguide: a square, layered block of transparent elastomer, bonded to the glass."""
+
+    width_mm: Annotated[Positive, Field(description="Side of the square contact surface, mm.")]
+    layers: Annotated[
+        tuple[fem.Layer, ...],
+        Field(min_length=1, max_length=16, description="Elastic layers, from the contact side."),
+    ]
+    refractive_index: Annotated[
+        RefractiveIndex, Field(description="Refractive index of all layers at the light's wavelength.")
+    ] = 1.4336
+
+    @property
+    def thickness_mm(self) -> float:
+        """Thickness of all layers together, mm."""
+        return sum(layer.thickness_mm for layer in self.layers)
+
+
+@dataclass(frozen=True, config=CONFIG)
+class Light:
+    """The light of the LEDs."""
+
+    wavelength_nm: Annotated[
+        float, Field(ge=350.0, le=1100.0, description="Wavelength of the light, nm.")
+    ] = 550.0
+
+
+@dataclass(frozen=True, config=CONFIG)
+class Specimen:
+    """The tissue: a slab with free sides, fixed to a flat chest wall at its far face."""
+
+    thickness_mm: Annotated[Positive, Field(description="Thickness from contact surface to chest wall, mm.")]
+    width_mm: Annotated[Positive, Field(description="Side of the square slab, mm.")]
+    modulus_kPa: Annotated[Positive, Field(description="Young's modulus of the tissue, kPa.")]
+    poisson: Annotated[PoissonRatio, Field(description="Poisson's ratio of the tissue, up to 0.4999.")] = 0.49
+    refractive_index: Annotated[RefractiveIndex, Field(description="Refractive index of the tissue.")] = 1.40
+    albedo: Annotated[
+        float,
+        Field(
+            ge=0.0,
+            lt=1.0,
+            description="Share of the light that enters the tissue and comes back out, 0 to 1.",
+        ),
+    ] = 0.68
+
+
+@dataclass(frozen=True, config=CONFIG)
+class PressDepths:
+    """How the sensor is pressed where nothing else is said."""
+
+    indentation_mm: Annotated[
+        tuple[Positive, ...],
+        Field(min_length=1, description="Depths that the glass moves towards the chest wall, mm."),
+    ] = (2.0,)
+
+
+@dataclass(frozen=True, config=CONFIG)
+class Signal:
+    """The thresholds k above which a value is signal; fixed here, never chosen per picture."""
+
+    displacement_um: Annotated[Positive, Field(description="Threshold of the surface displacement, µm.")] = (
+        2.0
+    )
+    counts: Annotated[Positive, Field(description="Threshold of the picture, counts.")] = 10.0
+
+
+@dataclass(frozen=True, config=CONFIG)
+class Design:
+    """A tactile sensor, a specimen and a press: everything the twin needs but the inclusion."""
+
+    name: Annotated[
+        str, Field(min_length=1, max_length=100, description="Name of the design; it goes with every frame.")
+    ]
+    waveguide: Annotated[Waveguide, Field(description="The waveguide: size, index and elastic layers.")]
+    leds: Annotated[
+        tuple[Led, ...],
+        Field(min_length=1, max_length=64, description="The LEDs; one picture layer for each."),
+    ]
+    camera: Annotated[Camera, Field(description="The camera below the glass.")]
+    specimen: Annotated[Specimen, Field(description="The tissue slab, without its inclusion.")]
+    description: Annotated[str, Field(max_length=1000, description="One line for people.")] = ""
+    light: Annotated[Light, Field(description="The light of the LEDs.")] = Light()
+    glass: Annotated[Glass, Field(description="The rigid plate between waveguide and camera.")] = Glass()
+    surface: Annotated[Skin, Field(description="The rough contact between waveguide and tissue.")] = Skin()
+    press: Annotated[
+        PressDepths, Field(description="How the sensor is pressed where nothing else is said.")
+    ] = PressDepths()
+    signal: Annotated[Signal, Field(description="The thresholds k of the scalars.")] = Signal()
+
+    def __post_init__(self) -> None:
+        found = list(self._conflicts())
+        if found:
+            raise DesignError(found[0].field, found[0].received, found[0].allowed, more=len(found) - 1)
+
+    def probe(self) -> fem.Probe:
+        """Return the waveguide as the mechanics see it."""
+        return fem.Probe(width_mm=self.waveguide.width_mm, layers=self.waveguide.layers)
+
+    def slab(self) -> fem.Slab:
+        """Return the specimen as the mechanics see it."""
+        tissue = self.specimen
+        return fem.Slab(
+            thickness_mm=tissue.thickness_mm,
+            width_mm=tissue.width_mm,
+            modulus_kPa=tissue.modulus_kPa,
+            poisson=tissue.poisson,
+        )
+
+    def guide(self) -> Guide:
+        """Return the waveguide as light sees it."""
+        waveguide = self.waveguide
+        return Guide(waveguide.width_mm, waveguide.thickness_mm, waveguide.refractive_index)
+
+    def sensor(self) -> Sensor:
+        """Return the whole sensor as light sees it."""
+        return Sensor(
+            guide=self.guide(),
+            glass=self.glass,
+            leds=self.leds,
+            camera=self.camera,
+            skin=self.surface,
+            tissue=Tissue(refractive_index=self.specimen.refractive_index, albedo=self.specimen.albedo),
+            effective_modulus_kPa=self.effective_modulus_kPa,
+            wavelength_nm=self.light.wavelength_nm,
+        )
+
+    @property
+    def effective_modulus_kPa(self) -> float:
+        """Contact modulus E*, kPa: 1/E* = sum of (1 - nu²)/E over both surfaces (Johnson 1985, eq. 4.24)."""
+        sides = (self.waveguide.layers[0], self.specimen)
+        return 1.0 / sum((1.0 - side.poisson**2) / side.modulus_kPa for side in sides)
+
+    @property
+    def max_indentation_mm(self) -> float:
+        """Deepest press that is allowed, mm."""
+        return MAX_STRAIN * self.specimen.thickness_mm
+
+    def check_inclusion(self, inclusion: fem.Inclusion) -> None:
+        """Raise `DesignError` if the inclusion leaves the slab or touches the chest wall."""
+        slab, size, depth = self.specimen, inclusion.size, inclusion.depth
+        if depth + size >= slab.thickness_mm:
+            what = (
+                f"a size and depth (to its top) that add up to less than {slab.thickness_mm:g} mm, "
+                f"where the chest wall is; {size:g} + {depth:g} mm reaches it"
+            )
+            raise DesignError(
+                "inclusion.size" if size > depth else "inclusion.depth", shown(max(size, depth)), what
+            )
+        reach = slab.width_mm / 2 - size / 2
+        if max(abs(part) for part in inclusion.offset) >= reach:
+            raise DesignError(
+                "inclusion.offset",
+                shown(tuple(inclusion.offset)),
+                f"less than {reach:g} mm in x and y (the inclusion stays within the slab's width)",
+            )
+
+    def check_indentation(self, indentation: float, field: str = "press.indentation_mm") -> None:
+        """Raise `DesignError` if the press is not a depth in mm that the model can be trusted with."""
+        if not 0.0 < indentation <= self.max_indentation_mm:
+            raise DesignError(field, shown(indentation), f"{self._depth_in_words()}")
+
+    def _depth_in_words(self) -> str:
+        return f"a number > 0 and <= {self.max_indentation_mm:g} mm ({MAX_STRAIN:.0%} of the specimen)"
+
+    def _conflicts(self) -> Iterator[DesignError]:
+        for conflict in conflicts(self.guide(), self.leds, self.camera, self.surface):
+            field = conflict.field.replace("skin.", "surface.")
+            yield DesignError(field, shown(conflict.received), conflict.allowed)
+        if self.specimen.width_mm < self.waveguide.width_mm:
+            allowed = f"at least the waveguide's width of {self.waveguide.width_mm:g} mm"
+            yield DesignError("specimen.width_mm", shown(self.specimen.width_mm), allowed)
+        for number, depth in enumerate(self.press.indentation_mm):
+            if depth > self.max_indentation_mm:
+                yield DesignError(f"press.indentation_mm.{number}", shown(depth), self._depth_in_words())
+
+
+_ADAPTER = TypeAdapter(Design)
+
+
+class _Untitled(GenerateJsonSchema):
+    """Schema without titles made up from the names: editors would show "Pixel Um" before the description."""
+
+    def field_title_should_be_set(self, schema: Any) -> bool:
+        return False
+
+
+def design_schema() -> dict[str, Any]:
+    """Return the JSON schema (draft 2020-12) of a design file."""
+    schema = _ADAPTER.json_schema(schema_generator=_Untitled)
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        **schema,
+        "title": "TSIS twin design",
+    }
+
+
+def shipped_designs() -> list[str]:
+    """Return the names of the designs that come with the package."""
+    names = (entry.name for entry in files("assets").joinpath("designs").iterdir())
+    return sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml"))
+
+
+def load_design(name_or_path: str | Path) -> Design:
+    """Return the design of that name under ``assets/designs``, or of that TOML file.
+
+    A shipped name wins over a file of the same name: write ``./tsis`` for the latter.
+
+    Raises
+    ------
+    DesignError
+        One line: file, dotted field, the value received and what is allowed.
+    """
+    source = str(name_or_path)
+    text = _read(name_or_path)
+    try:
+        data = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        message, _, place = str(error).rpartition(" (at ")
+        raise DesignError(
+            place.rstrip(")") or "the file", f"text that is not TOML ({message})", "TOML", source=source
+        ) from None
+    return parse_design(data, source)
+
+
+def parse_design(data: dict[str, Any], source: str = "") -> Design:
+    """Return the design that nested tables describe; ``source`` names them in the error."""
+    schema = design_schema()
+    found = list(not_finite(data, schema))
+    if found:
+        first = found[0]
+        raise DesignError(first.field, first.received, first.allowed, source=source, more=len(found) - 1)
+    try:
+        # As JSON, because only there does pydantic's strict mode take a table for a dataclass and a list
+        # for a tuple while it still refuses "25" or true where a number belongs.
+        return _ADAPTER.validate_json(json.dumps(data, default=str), strict=True)
+    except ValidationError as error:
+        raise from_validation(error, data, schema).renamed(source=source) from None
+
+
+def _read(name_or_path: str | Path) -> str:
+    source = str(name_or_path)
+    place: Traversable | Path = Path(source)
+    if source in shipped_designs():
+        place = files("assets").joinpath("designs", f"{source}.toml")
+    try:
+        return place.read_text(encoding="utf-8")
+    except UnicodeDecodeError:
+        raise DesignError("the file", "bytes that are not UTF-8 text", "a TOML file", source=source) from None
+    except IsADirectoryError:
+        raise DesignError("DESIGN", f"the directory {shown(source)}", "a TOML file") from None
+    except (OSError, ValueError):
+        names = ", ".join(shipped_designs())
+        raise DesignError(
+            "DESIGN", shown(source), f"a shipped design ({names}) or a TOML file that can be read"
+        ) from None

@@ -1,0 +1,168 @@
+"""A frame: one press of the sensor on one specimen, as arrays in memory and as files on disk.
+
+Pictures are stored as seen from the specimen: columns grow with +x, rows with -y. Pressed in is negative
+``displacement`` in the fields and positive in every scalar.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fem import Inclusion
+from twin.design import Design
+from twin.stage import staged
+
+if TYPE_CHECKING:
+    import pyvista
+
+RECORD = "frame.json"
+PICTURES = ("frame.exr", "image.png", "tared.png", "reference.exr", "reference.png", "overview.png")
+FILES = frozenset({RECORD, "surface.vtp", *PICTURES})
+
+_PACKAGES = (
+    "tsis-twin",
+    "numpy",
+    "scipy",
+    "scikit-fem",
+    "pyvista",
+    "vtk",
+    "mitsuba",
+    "drjit",
+    "OpenEXR",
+    "matplotlib",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One press level: the picture, the fields behind it and the scalars of both."""
+
+    design: Design
+    inclusion: Inclusion | None
+    press: dict[str, float]
+    """``indentation_mm`` and ``force_N`` of the press on the specimen with its inclusion."""
+    seed: int
+    image: NDArray[Any]
+    """(rows, columns) counts, uint8, or uint16 above 8 bits."""
+    reference: NDArray[np.float32]
+    """(rows, columns) counts: mean of 16 noisy frames of the same press without inclusion."""
+    radiance: NDArray[np.float32]
+    """(n_led, rows, columns) W m⁻² sr⁻¹, one layer per LED, at the camera's lens."""
+    pressure: NDArray[np.float32]
+    """(rows, columns) contact pressure that each pixel looks at, kPa."""
+    displacement_z: NDArray[np.float32]
+    """(rows, columns) displacement of the surface that each pixel looks at, mm; negative is pressed in."""
+    surface: pyvista.PolyData
+    """Contact surface, mm, with the point arrays of `fem.press`."""
+    cut: pyvista.PolyData
+    """Cut y = 0 through probe and slab, mm, with the arrays of `fem.press`."""
+    fem: dict[str, Any] = field(default_factory=dict)
+    """Scalars ``raw`` and ``tared`` of the surface, ``min_pressure_kPa``, ``dof`` and ``seconds``."""
+    tsis: dict[str, Any] = field(default_factory=dict)
+    """Scalars ``raw`` and ``tared`` of the picture, ``seconds`` and ``noise_percent``."""
+
+    @property
+    def tared(self) -> NDArray[np.float32]:
+        """(rows, columns) counts of the picture minus those of the reference; negative ones too."""
+        return self.image.astype(np.float32) - self.reference
+
+    def record(self) -> dict[str, Any]:
+        """Return what `frame.json` says of the frame, but for the checksums of its files."""
+        inclusion = None
+        if self.inclusion is not None:
+            names = {"size": "size_mm", "depth": "depth_mm", "modulus": "modulus_kPa", "offset": "offset_mm"}
+            values = asdict(self.inclusion)
+            inclusion = {names[key]: values[key] for key in names}
+        return {
+            "inclusion": inclusion,
+            "press": self.press,
+            "fem": self.fem,
+            "tsis": self.tsis,
+            "design": self.design.name,
+            "seed": self.seed,
+            "versions": versions(),
+        }
+
+    def write(self, out: str | Path) -> Path:
+        """Write the frame's files into a new folder, or in place of an earlier frame; see `write_frames`."""
+        return write_frames([self], out)
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that a frame depends on."""
+    found = {"python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:  # run from a source tree that is not installed
+            found[package] = "unknown"
+    return found
+
+
+def write_frames(frames: Sequence[Frame], out: str | Path) -> Path:
+    """Write one frame straight into ``out``, several into ``out/00``, ``out/01``, ...; all or nothing.
+
+    Raises
+    ------
+    DesignError
+        If ``out`` holds anything but an earlier result of twin, or cannot be made.
+    """
+    with staged(out, holds_frames) as folder:
+        fill(frames, folder)
+    return Path(out)
+
+
+def fill(frames: Sequence[Frame], folder: Path) -> None:
+    """Write the frames into a folder that exists and is empty."""
+    for number, frame in enumerate(frames):
+        place = folder if len(frames) == 1 else folder / f"{number:02d}"
+        place.mkdir(exist_ok=True)
+        _write(frame, place)
+
+
+def holds_frames(folder: Path) -> bool:
+    """Return whether a folder holds what `write_frames` wrote, and nothing else."""
+    inside = list(folder.iterdir())
+    if all(entry.is_dir() and entry.name.isdigit() for entry in inside):
+        return bool(inside) and all(_holds_one_frame(entry) for entry in inside)
+    return _holds_one_frame(folder)
+
+
+def _holds_one_frame(folder: Path) -> bool:
+    names = {entry.name for entry in folder.iterdir()}
+    return RECORD in names and names <= FILES
+
+
+def _write(frame: Frame, folder: Path) -> None:
+    # Slow to import, and a look at `twin --help` needs none of them.
+    from scenes.camera import tare
+    from scenes.exr import write_exr, write_png
+    from twin.pictures import overview
+
+    layers = {f"led.{number}": layer for number, layer in enumerate(frame.radiance)}
+    fields = {"pressure": frame.pressure, "displacement.z": frame.displacement_z}
+    write_exr(folder / "frame.exr", {**layers, **fields})
+    write_exr(folder / "reference.exr", {"counts": frame.reference})
+    write_png(folder / "image.png", frame.image)
+    write_png(folder / "reference.png", np.rint(frame.reference).astype(frame.image.dtype))
+    write_png(folder / "tared.png", tare(frame.image, frame.reference, frame.design.camera.bits))
+    frame.surface.save(folder / "surface.vtp")
+    overview(frame, folder / "overview.png")
+    record = frame.record()
+    record["sha256"] = {path.name: _sha256(path) for path in sorted(folder.iterdir())}
+    text = json.dumps(record, indent=2, allow_nan=False, ensure_ascii=False)
+    (folder / RECORD).write_text(text + "\n", encoding="utf-8")
+
+
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -1,0 +1,100 @@
+"""What a person sees of a run: how far it is, and what came out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from twin.frame import Frame
+
+
+class Reporter:
+    """Progress on stderr: a bar with the time left on a terminal, otherwise one line per finished stage.
+
+    Call it with a stage's name when the stage starts, and the share of all work that is done by then.
+    """
+
+    def __init__(self) -> None:
+        self._console = Console(stderr=True)
+        self._stage, self._since = "", 0.0
+        self._bar: Progress | None = None
+        if self._console.is_terminal:
+            columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TextColumn("left"))
+            self._bar = Progress(*columns, TimeRemainingColumn(), console=self._console, transient=True)
+            self._task = self._bar.add_task("starting", total=1.0)
+
+    def __enter__(self) -> Self:
+        if self._bar:
+            self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bar:
+            self._bar.stop()
+        if kind is None:
+            self._close_stage()
+
+    def __call__(self, stage: str, done: float) -> None:
+        if self._bar:
+            self._bar.update(self._task, description=stage, completed=done)
+        elif stage != self._stage:
+            self._close_stage()
+            self._stage, self._since = stage, time.perf_counter()
+
+    def _close_stage(self) -> None:
+        # Told when it ends, so that a mistake found on the way is the only line there is.
+        if self._stage and not self._bar:
+            self._console.print(f"{self._stage}: {time.perf_counter() - self._since:.1f} s", highlight=False)
+
+
+def summarise(frames: Sequence[Frame], out: Path) -> None:
+    """Print the scalars of each frame, raw and tared, and where the files are."""
+    table = Table(title=_title(frames[0]), title_justify="left", caption_justify="left")
+    table.caption = (
+        "tared: minus the same press without inclusion; max of the surface in µm, total in mm³, area in mm²"
+    )
+    table.add_column("press")
+    for heading in ("surface max", "total", "area", "picture max", "total", "area"):
+        table.add_column(heading, justify="right")
+    for frame in frames:
+        press = f"{frame.press['indentation_mm']:.3g} mm, {frame.press['force_N']:.3g} N"
+        for kind in ("raw", "tared"):
+            surface, picture = frame.fem[kind], frame.tsis[kind]
+            table.add_row(
+                f"{press} {kind}",
+                f"{1e3 * surface['max_mm']:.2f} µm",
+                f"{surface['total_mm3']:.3f}",
+                f"{surface['area_mm2']:.1f}",
+                f"{picture['max_dn']:.1f} counts",
+                f"{picture['total_dn']:.0f}",
+                f"{picture['area_px']} px",
+            )
+            press = ""
+    console = Console(highlight=False)
+    console.print(table)
+    pages = (
+        [out / "overview.png"]
+        if len(frames) == 1
+        else [out / f"{n:02d}" / "overview.png" for n in range(len(frames))]
+    )
+    console.print("look at: " + ", ".join(str(page) for page in pages), soft_wrap=True)
+    console.print(f"all files: {out}", soft_wrap=True)
+
+
+def _title(frame: Frame) -> str:
+    inclusion = frame.inclusion
+    if inclusion is None:
+        return f"{frame.design.name}, no inclusion"
+    return (
+        f"{frame.design.name}, inclusion {inclusion.size:g} mm across, top {inclusion.depth:g} mm deep, "
+        f"{inclusion.modulus:g} kPa"
+    )

@@ -1,0 +1,95 @@
+"""A folder of results that appears whole or not at all.
+
+Everything is written to a hidden sibling and renamed into place at the end, so a full disk, a mistake or
+Ctrl-C leaves neither half a result nor a broken earlier one.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from twin.complaint import DesignError, shown
+
+
+@contextmanager
+def staged(out: str | Path, is_ours: Callable[[Path], bool]) -> Iterator[Path]:
+    """Yield an empty folder that becomes ``out`` when the block ends well, and vanishes when it does not.
+
+    ``out`` may be new, empty, or hold what an earlier run wrote and nothing else, which ``is_ours(out)``
+    decides; that is then replaced. Anything else is refused with a `DesignError`, as is a place that cannot
+    be written.
+    """
+    target = Path(os.path.abspath(out))
+    _refuse_foreign(out, target, is_ours)
+    made: list[Path] = []
+    try:
+        made = _make_parents(target.parent)
+        folder = target.with_name(f".{target.name}.{os.getpid()}.part")
+        folder.mkdir()
+    except OSError as error:
+        _remove_empty(made)
+        raise DesignError("out", shown(str(out)), f"a folder that can be made ({_reason(error)})") from None
+    try:
+        yield folder
+        _swap(folder, target)
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        _remove_empty(made)
+        raise
+
+
+def _refuse_foreign(out: str | Path, target: Path, is_ours: Callable[[Path], bool]) -> None:
+    allowed = "a new or empty folder, or one that holds an earlier result of twin and nothing else"
+    if target.is_symlink() or (target.exists() and not target.is_dir()):
+        raise DesignError("out", f"{shown(str(out))}, which is not a folder", allowed)
+    try:
+        foreign = target.is_dir() and any(target.iterdir()) and not is_ours(target)
+    except OSError as error:
+        raise DesignError("out", shown(str(out)), f"a folder that can be read ({_reason(error)})") from None
+    if foreign or target == target.parent:
+        raise DesignError("out", f"{shown(str(out))}, which holds something else", allowed)
+
+
+def _make_parents(parent: Path) -> list[Path]:
+    """Make a folder and those above it; return the new ones, the outermost first."""
+    missing = [place for place in (parent, *parent.parents) if not place.exists()]
+    made: list[Path] = []
+    try:
+        for place in reversed(missing):
+            place.mkdir()
+            made.append(place)
+    except OSError:
+        _remove_empty(made)
+        raise
+    return made
+
+
+def _remove_empty(made: list[Path]) -> None:
+    for place in reversed(made):
+        try:
+            place.rmdir()
+        except OSError:  # somebody else uses it by now
+            return
+
+
+def _swap(folder: Path, target: Path) -> None:
+    """Put the folder in the target's place; the earlier one goes only once the new one stands."""
+    if not target.exists():
+        folder.rename(target)
+        return
+    earlier = folder.with_suffix(".old")
+    target.rename(earlier)
+    try:
+        folder.rename(target)
+    except BaseException:
+        earlier.rename(target)
+        raise
+    shutil.rmtree(earlier, ignore_errors=True)
+
+
+def _reason(error: OSError) -> str:
+    return (error.strerror or "the system refuses it").lower()
