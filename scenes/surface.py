@@ -9,6 +9,7 @@ import pyvista as pv
 import trimesh
 from numpy.typing import NDArray
 from scipy.interpolate import CloughTocher2DInterpolator
+from scipy.ndimage import map_coordinates
 
 Array = NDArray[np.float64]
 
@@ -105,3 +106,24 @@ def _faces(n: int) -> NDArray[np.int64]:
     lower = np.column_stack([corner, corner + n, corner + 1])
     upper = np.column_stack([corner + 1, corner + n, corner + n + 1])
     return np.concatenate([lower, upper])
+
+
+def at(surface: OpticalSurface, position_mm: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Pressure, kPa, and displacement along z, mm, at deformed positions (..., 2) mm; both of shape (...).
+
+    The undeformed point of each position is found by fixed-point iteration, which contracts by the strain (a few per cent).
+    """
+    line = surface.nodes_mm
+    step = line[1] - line[0]
+
+    def look_up(values: Array, points: Array) -> Array:
+        index = (points[..., ::-1] - line[0]) / step
+        return np.asarray(map_coordinates(values, np.moveaxis(index, -1, 0), order=1, mode="nearest"))
+
+    target = np.asarray(position_mm, dtype=np.float64)
+    undeformed = target
+    for _ in range(4):
+        shift = np.stack([look_up(surface.displacement_mm[..., i], undeformed) for i in (0, 1)], axis=-1)
+        undeformed = target - shift
+    pressure = look_up(surface.pressure_kPa, undeformed)
+    return pressure.astype(np.float32), look_up(surface.displacement_mm[..., 2], undeformed).astype(np.float32)
