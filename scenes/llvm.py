@@ -39,9 +39,10 @@ from drjit.llvm.ad import Float, UInt32
 x = dr.linspace(Float, -1, 1, 1000)
 dr.enable_grad(x)
 y = dr.maximum(x, 0.25) + dr.minimum(x, 0.5) + dr.fma(x, x, 1) + dr.exp(dr.abs(x)) + dr.sqrt(dr.square(x) + 1)
-n, total = dr.while_loop((UInt32(0), dr.detach(y)), lambda n, t: n < 5, lambda n, t: (n + 1, dr.maximum(t / 2, 0.1)))
+start = UInt32(0), dr.detach(y)
+n, total = dr.while_loop(start, lambda n, t: n < 5, lambda n, t: (n + 1, dr.maximum(t / 2, 0.1)))
 bins = dr.zeros(Float, 10)
-dr.scatter_reduce(dr.ReduceOp.Add, bins, dr.detach(total), dr.arange(UInt32, 1000) % 10)
+dr.scatter_reduce(dr.ReduceOp.Add, bins, total, dr.arange(UInt32, 1000) % 10)
 dr.backward(dr.sum(y))
 assert dr.width(dr.grad(x)) == 1000 and dr.width(bins) == 10 and dr.all(bins > 0)
 assert dr.sum(dr.maximum(Float(1, 2, 4), 3))[0] == 10

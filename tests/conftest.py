@@ -1,0 +1,17 @@
+"""What all tests share."""
+
+import os
+
+import pytest
+
+# Pictures are drawn without a display, and the sums of a test do not depend on how many cores a machine has.
+os.environ["MPLBACKEND"] = "Agg"
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+
+@pytest.fixture(scope="session")
+def variant() -> str:
+    """Mitsuba on the CPU, which every machine has: ask for this fixture before importing mitsuba or drjit."""
+    from scenes.backend import use
+
+    return use("cpu")
