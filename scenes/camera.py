@@ -2,7 +2,7 @@
 
     radiance -> irradiance on the pixel -> electrons -> charge (shot, dark, well) -> counts (read, gain, ADC)
 
-Every noise draw comes from a generator that the caller hands in: a picture is a function of radiance and seed.
+Every noise draw comes from the caller's generator: a picture is a function of radiance and seed.
 What does not change from frame to frame (PRNU, DSNU) comes from the camera's own ``pattern_seed``.
 Left to later: vignetting (cos^4), lens transmission, defocus, dead pixels, colour filters.
 """
@@ -76,9 +76,9 @@ def expose(
 ) -> NDArray[Any]:
     """Counts that the camera delivers, from one noisy exposure or as the mean of several.
 
-    Charge is Poisson about light times the pixel's own response (PRNU) plus dark current, and stops at the full
-    well; read noise (normal) and the pixel's dark offset (DSNU) follow, then gain, offset, rounding and the
-    converter's range: y = K (mu_e + n_d) + quantisation with K = 1 / gain (EMVA 1288 release 4.0 linear,
+    Charge is Poisson about light times the pixel's own response (PRNU) plus dark current, and stops at the
+    full well; read noise (normal) and the pixel's dark offset (DSNU) follow, then gain, offset, rounding and
+    the converter's range: y = K (mu_e + n_d) + quantisation with K = 1 / gain (EMVA 1288 release 4.0 linear,
     section 2; key ``emva1288``).
 
     Parameters
@@ -92,7 +92,7 @@ def expose(
 
     Returns
     -------
-    (rows, columns) uint8, or uint16 above 8 bits; with ``frames`` > 1 the mean of that many pictures as float32.
+    (rows, columns) uint8, or uint16 above 8 bits; with ``frames`` > 1 the mean of so many as float32.
     """
     if isinstance(frames, bool) or not isinstance(frames, (int, np.integer)) or frames < 1:
         raise CameraError(f"frames: received {frames!r}, allowed: a whole number of at least 1")
@@ -137,7 +137,8 @@ def fixed_pattern(camera: Camera) -> tuple[Float, Float]:
     """The pixels' own response (mean 1) and dark offset in electrons (mean 0), (rows, columns), read-only.
 
     Normal maps of standard deviation PRNU and DSNU (EMVA 1288 release 4.0 linear, section 4; key
-    ``emva1288``). They belong to the one camera, hence to ``camera.pattern_seed``, and are the same in every frame.
+    ``emva1288``). They belong to the one camera, hence to ``camera.pattern_seed``,
+    and are the same in every frame.
     """
     return _pattern(camera.rows, camera.columns, camera.prnu_percent, camera.dsnu_e, camera.pattern_seed)
 

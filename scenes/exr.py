@@ -1,8 +1,8 @@
 """Pictures on disk: OpenEXR for floats, PNG for counts. The same arrays give the same bytes.
 
-A file appears under its name only when all of it is on the disk (temporary name beside it, flush, fsync, rename),
-so a run that is cut off leaves the old file or none. EXR carries no checksum of its own: who needs to know that
-nobody touched a pixel keeps the file's SHA-256.
+A file appears under its name only when all of it is on the disk (temporary name beside it, flush, fsync,
+rename), so a run that is cut off leaves the old file or none. EXR has no checksum of its own: who needs to
+know that nobody touched a pixel keeps the file's SHA-256.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ StrPath = str | os.PathLike[str]
 
 # Attributes that describe the pixels themselves (OpenEXR technical introduction, "required attributes").
 _OWN = frozenset(
-    ("channels", "chunkCount", "compression", "dataWindow", "displayWindow", "lineOrder", "name")
-    + ("pixelAspectRatio", "screenWindowCenter", "screenWindowWidth", "tiles", "type", "version")
+    {"channels", "chunkCount", "compression", "dataWindow", "displayWindow", "lineOrder", "name"}
+    | {"pixelAspectRatio", "screenWindowCenter", "screenWindowWidth", "tiles", "type", "version"}
 )
 
 
@@ -55,14 +55,12 @@ def write_exr(
         shape = array.shape if shape is None else shape
         if array.dtype != np.float32 or array.ndim != 2 or array.size == 0 or array.shape != shape:
             raise ImageError(
-                f"{path}: channel {name}: received {array.dtype} {array.shape}, allowed: float32 (rows, columns), "
-                f"one shape for all"
+                f"{path}: channel {name}: received {array.dtype} {array.shape}, allowed: float32 "
+                "(rows, columns), one shape for all"
             )
         if not 1 <= len(name.encode()) <= 255 or "\0" in name:
             raise ImageError(f"{path}: channel name: received {name!r}, allowed: 1 to 255 bytes")
-        planes[name] = np.ascontiguousarray(
-            array
-        )  # OpenEXR 3.5 ignores strides and would scramble the pixels
+        planes[name] = np.ascontiguousarray(array)  # OpenEXR 3.5 ignores strides: pixels get scrambled
     text = dict(header or {})
     for key, value in text.items():
         if key in _OWN or not key or not isinstance(value, str):

@@ -27,7 +27,7 @@ def flat(camera: Camera, electrons: float) -> np.ndarray:
 
 
 def temporal_variance(camera: Camera, electrons: float, seed: int) -> tuple[float, float]:
-    """Mean and temporal variance from a pair of frames, so the fixed pattern drops out (EMVA 1288, section 6)."""
+    """Mean and temporal variance of a pair of frames: the fixed pattern drops out (EMVA 1288, section 6)."""
     rng, light = generator(seed), flat(camera, electrons)
     a, b = (expose(camera, light, WAVELENGTH_NM, rng).astype(float) for _ in range(2))
     return float((a.mean() + b.mean()) / 2), float((a - b).var() / 2)
@@ -65,7 +65,7 @@ def test_more_photons_at_longer_wavelength():
 
 
 def test_etendue_is_conserved_through_the_lens():
-    """Flux through the pixel = radiance x etendue on the object's side: pixel's footprint x solid angle of the pupil."""
+    """Flux through the pixel = radiance x area seen by the pixel x solid angle of the pupil."""
     focal_mm, m = 10.0, 768 * 8.4e-3 / 25.0
     camera = replace(PAPER, f_number=2.0)
     pupil_mm2 = np.pi / 4 * (focal_mm / camera.f_number) ** 2
