@@ -115,12 +115,10 @@ class Design:
     camera: Annotated[Camera, Field(description="The camera below the glass.")]
     specimen: Annotated[Specimen, Field(description="The tissue slab, without its inclusion.")]
     description: Annotated[str, Field(max_length=1000, description="One line for people.")] = ""
-    light: Annotated[Light, Field(description="The light of the LEDs.")] = Light()
+    light: Annotated[Light, Field(description="What light the LEDs give.")] = Light()
     glass: Annotated[Glass, Field(description="The rigid plate between waveguide and camera.")] = Glass()
     surface: Annotated[Skin, Field(description="The rough contact between waveguide and tissue.")] = Skin()
-    press: Annotated[
-        PressDepths, Field(description="How the sensor is pressed where nothing else is said.")
-    ] = PressDepths()
+    press: Annotated[PressDepths, Field(description="The press, where nothing else is said.")] = PressDepths()
     signal: Annotated[Signal, Field(description="The thresholds k of the scalars.")] = Signal()
 
     def __post_init__(self) -> None:
