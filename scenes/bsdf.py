@@ -1,0 +1,144 @@
+"""The contact surface as a Mitsuba BSDF: frustrated total internal reflection in front of a diffusing tissue.
+
+Import only after a variant is set (`scenes.backend.use`): Mitsuba binds the class to the active variant.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .contact import ContactOptics
+
+
+class Table:
+    """A `ContactOptics` on the device, looked up bilinearly.
+
+    `transmittance(fraction, cosine)`, `hemispherical(fraction)` and `diffuse_gain(fraction)` take and return `mi.Float`.
+    """
+
+    def __init__(self, packed: mi.TensorXf) -> None:
+        self.rows, self.columns = packed.shape[0], packed.shape[1] - 2
+        columns = packed.numpy()
+        self._t = mi.Float(columns[:, :-2].ravel())
+        self._mean = mi.Float(columns[:, -2].copy())
+        self._gain = mi.Float(columns[:, -1].copy())
+
+    @staticmethod
+    def pack(optics: ContactOptics) -> mi.TensorXf:
+        """One (n_fraction, n_cos + 2) tensor, the form in which a Mitsuba scene description can carry it."""
+        sides = (optics.transmittance, optics.hemispherical[:, None], optics.diffuse_gain[:, None])
+        return mi.TensorXf(np.hstack(sides).astype(np.float32))
+
+    def transmittance(self, fraction: mi.Float, cosine: mi.Float, active: mi.Bool | bool = True) -> mi.Float:
+        i, u = _cell(fraction, self.rows)
+        j, v = _cell(cosine, self.columns)
+        corner = i * self.columns + j
+        t00, t01 = (dr.gather(mi.Float, self._t, corner + k, active) for k in (0, 1))
+        t10, t11 = (dr.gather(mi.Float, self._t, corner + self.columns + k, active) for k in (0, 1))
+        return dr.lerp(dr.lerp(t00, t01, v), dr.lerp(t10, t11, v), u)
+
+    def hemispherical(self, fraction: mi.Float, active: mi.Bool | bool = True) -> mi.Float:
+        return self._row(self._mean, fraction, active)
+
+    def diffuse_gain(self, fraction: mi.Float, active: mi.Bool | bool = True) -> mi.Float:
+        return self._row(self._gain, fraction, active)
+
+    def _row(self, data: mi.Float, fraction: mi.Float, active: mi.Bool | bool) -> mi.Float:
+        i, u = _cell(fraction, self.rows)
+        return dr.lerp(dr.gather(mi.Float, data, i, active), dr.gather(mi.Float, data, i + 1, active), u)
+
+
+def _cell(x: mi.Float, nodes: int) -> tuple[mi.UInt32, mi.Float]:
+    scaled = dr.clip(x, 0.0, 1.0) * (nodes - 1)
+    index = dr.minimum(mi.UInt32(scaled), nodes - 2)
+    return index, scaled - mi.Float(index)
+
+
+class FrustratedTIR(mi.BSDF):
+    """Mirror reflection 1 - T and a diffuse lobe T(cos_i) T(cos_o) K / pi; reciprocal, and black from behind.
+
+    Properties: `table` (from `Table.pack`), `contact_fraction` (a texture, real contact fraction 0..1). The side that the surface
+    normal points to is the guide.
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        mi.BSDF.__init__(self, props)
+        self.table = Table(mi.TensorXf(props["table"]))
+        self.fraction = props["contact_fraction"]
+        mirror = mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.FrontSide | mi.BSDFFlags.SpatiallyVarying
+        diffuse = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide | mi.BSDFFlags.SpatiallyVarying
+        self.m_components = [mirror, diffuse]
+        self.m_flags = mirror | diffuse
+
+    def traverse(self, callback: Any) -> None:
+        callback.put("contact_fraction", self.fraction, mi.ParamFlags.Differentiable)
+
+    def sample(
+        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, sample1: mi.Float, sample2: mi.Point2f, active: mi.Bool
+    ) -> tuple[mi.BSDFSample3f, mi.Color1f]:
+        cos_i = mi.Frame3f.cos_theta(si.wi)
+        active = active & (cos_i > 0.0)
+        a, t, gain = self._at(si, cos_i, active)
+        mirror = mi.Float(1.0 if ctx.is_enabled(mi.BSDFFlags.DeltaReflection, 0) else 0.0) * (1.0 - t)
+        diffuse = mi.Float(1.0 if ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 1) else 0.0) * t * gain
+        albedo = mirror + diffuse * self.table.hemispherical(a, active)
+        p_mirror = dr.select(albedo > 0.0, mirror / albedo, 0.0)
+        is_mirror = sample1 < p_mirror
+
+        bs = dr.zeros(mi.BSDFSample3f)
+        spread = mi.warp.square_to_cosine_hemisphere(sample2)
+        cos_spread = mi.Frame3f.cos_theta(spread)
+        bs.wo = dr.select(is_mirror, mi.reflect(si.wi), spread)
+        bs.pdf = dr.select(is_mirror, p_mirror, (1.0 - p_mirror) * mi.warp.square_to_cosine_hemisphere_pdf(spread))
+        bs.eta = 1.0
+        bs.sampled_type = dr.select(
+            is_mirror, mi.UInt32(+mi.BSDFFlags.DeltaReflection), mi.UInt32(+mi.BSDFFlags.DiffuseReflection)
+        )
+        bs.sampled_component = dr.select(is_mirror, mi.UInt32(0), mi.UInt32(1))
+        active &= bs.pdf > 0.0
+        re_emitted = diffuse * self.table.transmittance(a, cos_spread, active) / (1.0 - p_mirror)
+        weight = dr.select(is_mirror, albedo, re_emitted)
+        return bs, mi.Color1f(weight) & active
+
+    def eval(
+        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool
+    ) -> mi.Color1f:
+        cos_i, cos_o = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
+        active = active & (cos_i > 0.0) & (cos_o > 0.0)
+        if not ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 1):
+            return mi.Color1f(0.0)
+        a, t, gain = self._at(si, cos_i, active)
+        value = t * gain * self.table.transmittance(a, cos_o, active) * cos_o * dr.inv_pi
+        return mi.Color1f(value) & active
+
+    def pdf(self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool) -> mi.Float:
+        cos_i, cos_o = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
+        active = active & (cos_i > 0.0) & (cos_o > 0.0)
+        if not ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 1):
+            return mi.Float(0.0)
+        a, t, gain = self._at(si, cos_i, active)
+        mirror = mi.Float(1.0 if ctx.is_enabled(mi.BSDFFlags.DeltaReflection, 0) else 0.0) * (1.0 - t)
+        albedo = mirror + t * gain * self.table.hemispherical(a, active)
+        share = dr.select(albedo > 0.0, 1.0 - mirror / albedo, 0.0)
+        return dr.select(active, share * cos_o * dr.inv_pi, 0.0)
+
+    def eval_pdf(
+        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool
+    ) -> tuple[mi.Color1f, mi.Float]:
+        return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
+
+    def _at(
+        self, si: mi.SurfaceInteraction3f, cos_i: mi.Float, active: mi.Bool
+    ) -> tuple[mi.Float, mi.Float, mi.Float]:
+        a = self.fraction.eval_1(si, active)
+        return a, self.table.transmittance(a, cos_i, active), self.table.diffuse_gain(a, active)
+
+    def to_string(self) -> str:
+        return f"FrustratedTIR[table = {self.table.rows} x {self.table.columns}]"
+
+
+mi.register_bsdf("frustrated_tir", FrustratedTIR)

@@ -1,0 +1,154 @@
+"""The Mitsuba scene: guide, walls, glass, LEDs and the deformed contact surface, which is updated in place.
+
+Import only after a variant is set (`scenes.backend.use`).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from . import bsdf, pinhole, surface
+from .contact import ContactOptics, contact_fraction, contact_optics
+from .sensor import Led, Sensor
+
+_BLACK = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.0}}}
+_OUTWARD = {"+x": (1.0, 0.0), "-x": (-1.0, 0.0), "+y": (0.0, 1.0), "-y": (0.0, -1.0)}
+_WALL_TOP_MM = 0.5  # walls reach above the contact surface, which bulges a little beside the press
+
+
+def optics_of(sensor: Sensor) -> ContactOptics:
+    """The table of the contact's optics for this sensor."""
+    skin, tissue = sensor.skin, sensor.tissue
+    return contact_optics(
+        sensor.guide.refractive_index,
+        skin.gap_index,
+        tissue.refractive_index,
+        tissue.albedo,
+        skin.rms_height_um,
+        sensor.wavelength_nm,
+    )
+
+
+def load_scene(sensor: Sensor, optics: ContactOptics) -> mi.Scene:
+    """Load the sensor with a flat, unloaded contact surface.
+
+    The contact surface is the mesh with id `contact`; LED number i is the shape with id `led_i`. Media are separated by single
+    faces: guide to air (side walls), guide to glass, glass to air. The glass's rim is held in a black frame and nothing
+    surrounds the sensor (a black housing). Side walls stay flat: their bulge under load, 0.1 mm, is left out.
+    """
+    guide, glass = sensor.guide, sensor.glass
+    half, bottom = guide.width_mm / 2, -guide.thickness_mm
+    lowest = bottom - glass.thickness_mm
+    side_wall = _dielectric(guide.refractive_index, 1.0)
+    scene: dict[str, Any] = {
+        "type": "scene",
+        "camera": pinhole.describe(sensor),
+        "contact": _contact_mesh(sensor, optics),
+        "guide_to_glass": _face(half, bottom, _dielectric(guide.refractive_index, glass.refractive_index)),
+        "glass_to_air": _face(half, lowest, _dielectric(glass.refractive_index, 1.0)),
+    }
+    for side, outward in _OUTWARD.items():
+        scene[f"wall_{side}"] = _wall(half, bottom, _WALL_TOP_MM, outward, side_wall)
+        scene[f"rim_{side}"] = _wall(half, lowest, bottom, outward, _BLACK)
+    for number, led in enumerate(sensor.leds):
+        scene[f"led_{number}"] = _led(led, half)
+    return mi.load_dict(scene)
+
+
+def put_surface(scene: mi.Scene, sensor: Sensor, deformed: surface.OpticalSurface) -> None:
+    """Move the scene's contact mesh to the deformed shape and set its real contact fraction, in place."""
+    mesh = surface.triangulate(deformed)
+    parameters = mi.traverse(scene)
+    parameters["contact.vertex_positions"] = _flat(mesh.vertices)
+    parameters["contact.vertex_normals"] = _flat(mesh.vertex_normals)
+    parameters["contact.vertex_contact_fraction"] = _flat(_fraction(sensor, deformed))
+    parameters.update()
+
+
+def light_only(scene: mi.Scene, sensor: Sensor, number: int | None) -> None:
+    """Switch all LEDs off but `number`, or all on for None."""
+    parameters = mi.traverse(scene)
+    for other, led in enumerate(sensor.leds):
+        on = number is None or other == number
+        parameters[f"led_{other}.emitter.radiance.value"] = _radiance(led) if on else 0.0
+    parameters.update()
+
+
+def led_frame(led: Led, half_mm: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Centre (3,) mm of an LED's disc, its unit axis (3,) into the guide, and a unit tangent (3,)."""
+    outward = np.array([*_OUTWARD[led.side], 0.0])
+    tangent = np.array([abs(outward[1]), abs(outward[0]), 0.0])  # along the side, in +x or +y
+    away = led.gap_mm if led.coupling == "air" else -led.gap_mm
+    centre = outward * (half_mm + away) + tangent * led.along_mm + np.array([0.0, 0.0, led.z_mm])
+    return centre, -outward, tangent
+
+
+def _contact_mesh(sensor: Sensor, optics: ContactOptics) -> mi.Mesh:
+    start = surface.flat(sensor.guide.width_mm, 0.0)
+    shape = surface.triangulate(start)
+    properties = mi.Properties()
+    properties["bsdf"] = mi.load_dict(
+        {
+            "type": "frustrated_tir",
+            "table": bsdf.Table.pack(optics),
+            "contact_fraction": {"type": "mesh_attribute", "name": "vertex_contact_fraction"},
+        }
+    )
+    mesh = mi.Mesh("contact", len(shape.vertices), len(shape.faces), properties, has_vertex_normals=True)
+    mesh.add_attribute("vertex_contact_fraction", 1, np.zeros(len(shape.vertices), dtype=np.float32))
+    parameters = mi.traverse(mesh)
+    parameters["faces"] = mi.UInt32(np.ascontiguousarray(shape.faces, dtype=np.uint32).ravel())
+    parameters["vertex_positions"] = _flat(shape.vertices)
+    parameters["vertex_normals"] = _flat(shape.vertex_normals)
+    parameters.update()
+    return mesh
+
+
+def _fraction(sensor: Sensor, deformed: surface.OpticalSurface) -> np.ndarray:
+    skin = sensor.skin
+    fraction = contact_fraction(deformed.pressure_kPa, sensor.effective_modulus_kPa, skin.rms_slope, skin.kappa)
+    return surface.with_skirt(fraction)
+
+
+def _flat(values: np.ndarray) -> mi.Float:
+    return mi.Float(np.ascontiguousarray(values, dtype=np.float32).ravel())
+
+
+def _dielectric(inside: float, outside: float) -> dict[str, Any]:
+    if inside == outside:  # Mitsuba refuses an interface between equal indices
+        return {"type": "null"}
+    return {"type": "dielectric", "int_ior": inside, "ext_ior": outside}
+
+
+def _face(half: float, z: float, material: dict[str, Any]) -> dict[str, Any]:
+    """A horizontal square whose normal points down, away from the guide."""
+    turn = mi.ScalarTransform4f().translate([0, 0, z]).rotate([1, 0, 0], 180).scale([half, half, 1])
+    return {"type": "rectangle", "to_world": turn, "bsdf": material}
+
+
+def _wall(half: float, low: float, high: float, outward: tuple[float, float], material: dict[str, Any]) -> dict[str, Any]:
+    """A vertical rectangle between two heights whose normal points outward."""
+    place = mi.ScalarPoint3f(outward[0] * half, outward[1] * half, 0.5 * (low + high))
+    aim = place + mi.ScalarVector3f(*outward, 0.0)
+    look = mi.ScalarTransform4f().look_at(origin=place, target=aim, up=[0, 0, 1])
+    return {"type": "rectangle", "to_world": look.scale([half, 0.5 * (high - low), 1]), "bsdf": material}
+
+
+def _led(led: Led, half: float) -> dict[str, Any]:
+    centre, axis, _ = led_frame(led, half)
+    place = mi.ScalarTransform4f().look_at(origin=centre.tolist(), target=(centre + axis).tolist(), up=[0, 0, 1])
+    return {
+        "type": "disk",
+        "to_world": place.scale(led.diameter_mm / 2),
+        "bsdf": _BLACK,
+        "emitter": {"type": "area", "radiance": {"type": "uniform", "value": _radiance(led)}},
+    }
+
+
+def _radiance(led: Led) -> float:
+    """Radiance of a Lambertian disc, W / (mm² sr)."""
+    return float(led.flux_W / (dr.pi * (dr.pi * led.diameter_mm**2 / 4)))

@@ -1,0 +1,103 @@
+"""The law of frustrated total internal reflection: light through one plane gap between two media."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+def gap_transmittance(
+    n1: ArrayLike,
+    n0: ArrayLike,
+    n3: ArrayLike,
+    gap_um: ArrayLike,
+    cos_theta: ArrayLike,
+    wavelength_nm: ArrayLike,
+) -> tuple[Array, Array]:
+    """Power transmittance of a lossless gap, s and p polarised, all interference included.
+
+    Light in medium `n1` (the guide) meets a gap of index `n0` and thickness `gap_um`, behind it medium `n3` (the tissue).
+    Closed form of the three-layer characteristic matrix (Yeh 1988, ch. 4 and 5; key yeh1988), with
+    q = n cos(theta), w = n0² - n1² sin²(theta), a = 2 pi g / lambda and S² = sin²(a sqrt(w)) / w:
+
+        T_s = 4 q1 q3 / [(q1 + q3)² + S² (n1² - n0²)(n3² - n0²)]
+        T_p = 4 y1 y3 / [(y1 + y3)² + (S² / n0⁴)(y1² w - n0⁴)(y3² w - n0⁴)],   y = n² / q
+
+    Below the critical angle of the gap w > 0 (Fabry-Pérot fringes); beyond it w < 0 and S² = sinh²(a sqrt(-w)) / (-w): the
+    evanescent wave tunnels. Where `n3` itself admits no propagating wave (n1 sin(theta) > n3) both are zero.
+
+    Parameters
+    ----------
+    n1, n0, n3
+        Refractive indices, each ≥ 1. All arguments broadcast against each other.
+    gap_um
+        Gap thickness, µm, ≥ 0.
+    cos_theta
+        Cosine of the angle of incidence inside `n1`, 0 to 1.
+    wavelength_nm
+        Vacuum wavelength, nm, > 0.
+
+    Returns
+    -------
+    (T_s, T_p)
+        Arrays of the broadcast shape, 0 to 1.
+
+    Raises
+    ------
+    ValueError
+        An argument outside the ranges above; the message names it.
+    """
+    values = {
+        "n1": n1,
+        "n0": n0,
+        "n3": n3,
+        "gap_um": gap_um,
+        "cos_theta": cos_theta,
+        "wavelength_nm": wavelength_nm,
+    }
+    arrays = {name: np.asarray(value, dtype=np.float64) for name, value in values.items()}
+    _check(arrays)
+    i1, i0, i3, gap, cos1, wavelength = np.broadcast_arrays(*arrays.values())
+
+    k2 = i1**2 * (1.0 - cos1**2)  # squared tangential index, conserved through the stack
+    w = i0**2 - k2
+    q1 = i1 * cos1
+    q3_squared = i3**2 - k2
+    open_ = (q3_squared > 0.0) & (cos1 > 0.0)  # a wave can leave into n3
+    q3 = np.sqrt(np.where(open_, q3_squared, 1.0))
+    q1 = np.where(open_, q1, 1.0)
+
+    s2 = _sine_squared_over(w, 2e3 * np.pi * gap / wavelength)
+    t_s = 4.0 * q1 * q3 / ((q1 + q3) ** 2 + s2 * (i1**2 - i0**2) * (i3**2 - i0**2))
+
+    y1, y3 = i1**2 / q1, i3**2 / q3
+    i04 = i0**4
+    t_p = 4.0 * y1 * y3 / ((y1 + y3) ** 2 + s2 / i04 * (y1**2 * w - i04) * (y3**2 * w - i04))
+    return np.where(open_, t_s, 0.0), np.where(open_, t_p, 0.0)
+
+
+def _sine_squared_over(w: Array, a: Array) -> Array:
+    """S² = sin²(a sqrt(w)) / w, continued through w = 0 (a²) into sinh²(a sqrt(-w)) / (-w)."""
+    x = a * np.sqrt(np.abs(w))
+    x_capped = np.minimum(x, 300.0)  # sinh² beyond this is > 1e259: the transmittance is 0 in double precision
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.where(w > 0.0, np.sin(x), np.sinh(x_capped)) / x
+    return a**2 * np.where(x > 1e-8, ratio, 1.0) ** 2
+
+
+def _check(arrays: dict[str, Array]) -> None:
+    allowed = {
+        "n1": (1.0, np.inf),
+        "n0": (1.0, np.inf),
+        "n3": (1.0, np.inf),
+        "gap_um": (0.0, np.inf),
+        "cos_theta": (0.0, 1.0),
+        "wavelength_nm": (np.nextafter(0.0, 1.0), np.inf),
+    }
+    for name, (low, high) in allowed.items():
+        bad = ~((arrays[name] >= low) & (arrays[name] <= high) & np.isfinite(arrays[name]))
+        if np.any(bad):
+            received = arrays[name][bad].flat[0]
+            raise ValueError(f"gap_transmittance: {name}: received {received}; allowed {low:g} to {high:g}, finite")

@@ -1,0 +1,152 @@
+"""Radiance pictures of a pressed surface: one scene per sensor, one layer per LED, three qualities."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import backend, surface, view
+from .sensor import Sensor
+
+if TYPE_CHECKING:
+    import pyvista as pv
+
+    from .gather import Sight
+
+Quality = Literal["preview", "standard", "reference"]
+
+PATHS_PER_LED = {"preview": 2**17, "standard": 2**20}
+"""Light paths that the traced qualities spend on each LED; "reference" has samples per pixel instead."""
+
+REFERENCE_SAMPLES = 4096
+"""Samples per pixel of a reference picture."""
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """What the camera's lens receives, and what it looks at.
+
+    Attributes
+    ----------
+    radiance : (n_led, rows, columns)
+        Radiance at the lens from each LED, W m⁻² sr⁻¹.
+    position_mm : (rows, columns, 2)
+        Point of the deformed contact surface that the middle of each pixel sees, x and y, mm.
+    pressure, displacement_z : (rows, columns)
+        Contact pressure, kPa, and displacement, mm (+z into the specimen), at that point.
+    noise_percent : float
+        Standard error of the radiance of all LEDs together from the Monte Carlo method, in per cent of it, median over the
+        pixels; measured from independent halves (traced) or from the spread of the samples (reference).
+    seconds : float
+        Wall-clock time.
+    """
+
+    radiance: NDArray[np.float32]
+    position_mm: NDArray[np.float32]
+    pressure: NDArray[np.float32]
+    displacement_z: NDArray[np.float32]
+    noise_percent: float
+    seconds: float
+
+
+class Renderer:
+    """A sensor's scene, built once; each `render` moves its contact surface in place and traces light again."""
+
+    def __init__(self, sensor: Sensor, device: str = "auto") -> None:
+        """Load the scene on `device` ("auto", "cpu" or "cuda"; see `backend.use`)."""
+        backend.use(device)
+        # only now: Mitsuba's classes bind to the variant that is active when they are defined
+        from . import build
+        from .bsdf import Table
+        from .trace import angular_basis
+
+        self.sensor = sensor
+        self.rays = view.pixel_rays(sensor)
+        optics = build.optics_of(sensor)
+        self.table = Table(Table.pack(optics))
+        self.basis = angular_basis(optics)
+        self.scene = build.load_scene(sensor, optics)
+
+    def render(
+        self,
+        pressed: pv.PolyData,
+        *,
+        field: str = "pressure",
+        quality: Quality = "standard",
+        seed: int = 0,
+        samples: int | None = None,
+        progress: Callable[[float], None] | None = None,
+    ) -> Rendering:
+        """Return the radiance picture of a pressed contact surface.
+
+        Parameters
+        ----------
+        pressed
+            Contact surface: points (n, 3) mm undeformed, with point arrays `displacement` and `pressure`.
+        field
+            "pressure", or "pressure_0" for the press without inclusion (and `displacement_0` with it).
+        quality
+            "preview" and "standard" trace light from the LEDs; "reference" is stock `path` through the real scene: hours.
+        seed
+            Seed of the light. The same seed gives the same bytes, whatever the number of threads.
+        samples
+            Light paths per LED, or per pixel for "reference", instead of the quality's own number.
+        progress
+            Called with the finished share, 0 to 1.
+        """
+        if quality not in (*PATHS_PER_LED, "reference"):
+            raise ValueError(f"quality: received {quality!r}; allowed: 'preview', 'standard', 'reference'")
+        from . import build, gather
+
+        start = time.perf_counter()
+        tell = progress or (lambda done: None)
+        shape = surface.resample(pressed, self.sensor.guide.width_mm, suffix=field.removeprefix("pressure"))
+        build.put_surface(self.scene, self.sensor, shape)
+        sight = gather.look(self.scene, self.sensor, self.table, self.rays)
+        if quality == "reference":
+            radiance, noise = self._reference(samples or REFERENCE_SAMPLES, seed, tell)
+        else:
+            radiance, noise = self._traced(sight, samples or PATHS_PER_LED[quality], seed, tell)
+        pressure, displacement_z = surface.at(shape, sight.position_mm)
+        return Rendering(radiance, sight.position_mm, pressure, displacement_z, noise, time.perf_counter() - start)
+
+    def _traced(
+        self, sight: Sight, samples: int, seed: int, tell: Callable[[float], None]
+    ) -> tuple[NDArray[np.float32], float]:
+        from . import gather, trace
+
+        halves = []
+        for half in (0, 1):
+            landed = trace.trace(self.scene, self.sensor, self.basis, max(samples // 2, 1), 2 * seed + half)
+            halves.append(gather.picture(sight, self.basis, trace.smooth(landed)))
+            tell(0.5 * (half + 1))
+        radiance = 0.5 * (halves[0] + halves[1])
+        both = [layers.sum(axis=0, dtype=np.float64) for layers in halves]
+        spread, mean = 0.5 * np.abs(both[0] - both[1]), 0.5 * (both[0] + both[1])
+        # half the difference of the halves is one draw of the mean's error, |error| of a normal has median 0.6745 sigma
+        return radiance, float(100.0 * np.median(spread / np.maximum(mean, 1e-30)) / 0.6745)
+
+    def _reference(self, samples: int, seed: int, tell: Callable[[float], None]) -> tuple[NDArray[np.float32], float]:
+        from . import build, reference
+
+        layers, variance = [], 0.0
+        count = len(self.sensor.leds)
+        for led in range(count):
+            build.light_only(self.scene, self.sensor, led)
+            mean, error = reference.path_trace(
+                self.scene,
+                self.sensor,
+                samples,
+                seed * count + led,
+                progress=lambda done, led=led: tell((led + done) / count),  # type: ignore[misc]
+            )
+            layers.append(mean.astype(np.float32))
+            variance = variance + error**2
+        radiance = np.stack(layers)
+        relative = np.sqrt(variance) / np.maximum(radiance.sum(axis=0), 1e-30)
+        return radiance, float(100.0 * np.median(relative))

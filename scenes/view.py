@@ -1,0 +1,105 @@
+"""What the camera's pinhole sees: pixel rays refracted through the two flat faces of the glass, in closed form."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+
+from .sensor import Sensor
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PixelRays:
+    """Rays of the camera's pixels just inside the guide's lower face, going up.
+
+    Attributes
+    ----------
+    origin_mm, direction : (rows, columns, 3)
+        Point on the face between guide and glass, and unit direction.
+    transmittance : (rows, columns)
+        Fresnel transmittance of both faces together, unpolarised, with the reflections inside the glass summed.
+    radiance_scale : float
+        Radiance in air over radiance in the guide of an unattenuated ray, 1/n² (conservation of étendue).
+    """
+
+    origin_mm: Array
+    direction: Array
+    transmittance: Array
+    radiance_scale: float
+
+
+def tangent_scale(sensor: Sensor) -> float:
+    """Tangent of the ray angle in air per mm on the camera's sensor.
+
+    Chosen so that the picture is exactly `field_of_view_mm` wide where its middle row meets the contact surface, refraction
+    included; the optics are otherwise rectilinear.
+    """
+    edge = sensor.camera.field_of_view_mm / 2
+
+    def miss(sine: float) -> float:
+        return _reach(sensor, sine) - edge
+
+    sine = float(brentq(miss, 0.0, np.sin(np.arctan(edge / sensor.camera.distance_mm)), xtol=1e-15))
+    return float(sine / np.sqrt(1.0 - sine**2) / (0.5e-3 * sensor.camera.columns * sensor.camera.pixel_um[0]))
+
+
+def air_directions(sensor: Sensor, column: Array, row: Array) -> Array:
+    """Unit directions (..., 3) in air, from the pinhole up, of picture coordinates (0 to columns, 0 to rows; x.5 are middles)."""
+    camera, scale = sensor.camera, tangent_scale(sensor)
+    tangent_x = (np.asarray(column) - camera.columns / 2) * camera.pixel_um[0] * 1e-3 * scale
+    tangent_y = -(np.asarray(row) - camera.rows / 2) * camera.pixel_um[1] * 1e-3 * scale
+    direction = np.stack(np.broadcast_arrays(tangent_x, tangent_y, np.ones_like(tangent_x)), axis=-1)
+    return np.asarray(direction / np.linalg.norm(direction, axis=-1, keepdims=True))
+
+
+def pixel_rays(sensor: Sensor) -> PixelRays:
+    """Refract the ray through the middle of each pixel into the guide."""
+    camera, glass, guide = sensor.camera, sensor.glass, sensor.guide
+    column, row = np.arange(camera.columns) + 0.5, np.arange(camera.rows)[:, None] + 0.5
+    in_air = air_directions(sensor, *np.broadcast_arrays(column, row))
+    in_glass = _refract(in_air, glass.refractive_index)
+    in_guide = _refract(in_air, guide.refractive_index)
+    offset = in_air[..., :2] / in_air[..., 2:] * camera.distance_mm
+    offset = offset + in_glass[..., :2] / in_glass[..., 2:] * glass.thickness_mm
+    origin = np.concatenate([offset, np.full((*offset.shape[:2], 1), -guide.thickness_mm)], axis=-1)
+    return PixelRays(origin, in_guide, 1.0 - faces_reflectance(sensor, in_guide[..., 2]), 1.0 / guide.refractive_index**2)
+
+
+def faces_reflectance(sensor: Sensor, cosine: Array) -> Array:
+    """Share of light that the faces guide/glass and glass/air send back into the guide, same shape as `cosine` (in the guide).
+
+    Incoherent sum over the reflections inside the glass: R = R1 + (1 - R1)² R2 / (1 - R1 R2).
+    """
+    n1, n2 = sensor.guide.refractive_index, sensor.glass.refractive_index
+    sine = n1 * np.sqrt(1.0 - np.asarray(cosine) ** 2)
+    first, second = _fresnel(n1, n2, sine), _fresnel(n2, 1.0, sine)
+    return np.asarray(first + (1.0 - first) ** 2 * second / (1.0 - first * second))
+
+
+def _fresnel(n_in: float, n_out: float, n_sine: Array) -> Array:
+    """Unpolarised Fresnel reflectance for tangential index n sin(theta) (Born & Wolf 1999, sec. 1.5.2; key born1999)."""
+    a = np.sqrt(np.maximum(n_in**2 - n_sine**2, 0.0))
+    b = np.sqrt(np.maximum(n_out**2 - n_sine**2, 0.0))
+    s = (a - b) / np.maximum(a + b, 1e-300)
+    p = (n_out**2 * a - n_in**2 * b) / np.maximum(n_out**2 * a + n_in**2 * b, 1e-300)
+    return np.asarray(np.where(n_sine < n_out, 0.5 * (s**2 + p**2), 1.0))
+
+
+def _refract(in_air: Array, index: float) -> Array:
+    tangential = in_air[..., :2] / index
+    return np.concatenate([tangential, np.sqrt(1.0 - np.sum(tangential**2, axis=-1, keepdims=True))], axis=-1)
+
+
+def _reach(sensor: Sensor, sine: float) -> float:
+    """Distance from the axis, mm, at which a ray of this sine in air meets the undeformed contact surface."""
+    path = (
+        (sensor.camera.distance_mm, 1.0),
+        (sensor.glass.thickness_mm, sensor.glass.refractive_index),
+        (sensor.guide.thickness_mm, sensor.guide.refractive_index),
+    )
+    return float(sum(length * sine / np.sqrt(n**2 - sine**2) for length, n in path))
