@@ -139,7 +139,6 @@ def simulate(
 
         tell(0.0)
         frames.append(_frame(design, inclusion, press, renderer, quality, seed, level, tell))
-    work.tell("done", 1.0, len(levels))
     return frames if several else frames[0]
 
 
@@ -227,6 +226,7 @@ def _frame(
     unlit = render("pressure_0", 0.5) if inclusion is not None else lit
     image = expose(lit, _PICTURE, 1)
     reference = expose(unlit, _REFERENCE, REFERENCE_FRAMES).astype(np.float32)
+    tell(1.0)
     return Frame(
         design=design,
         inclusion=inclusion,
