@@ -102,7 +102,7 @@ def _simulate(
             frames = simulate(design, inclusion, force=levels, **options)
         else:
             frames = simulate(design, inclusion, levels, **options)
-        report("files", 0.95)
+        report("files", 1.0)
         fill(frames, folder)
     summarise(frames, Path(arguments.out))
 

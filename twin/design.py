@@ -264,9 +264,10 @@ def parse_design(data: dict[str, Any], source: str = "") -> Design:
         first = found[0]
         raise DesignError(first.field, first.received, first.allowed, source=source, more=len(found) - 1)
     try:
-        # As JSON, because only there does pydantic's strict mode take a table for a dataclass and a list
-        # for a tuple while it still refuses "25" or true where a number belongs.
-        return _ADAPTER.validate_json(json.dumps(data, default=str), strict=True)
+        # As JSON, because only there does pydantic's strict mode take a table for a dataclass and a list for
+        # a tuple while it still refuses "25" or true where a number belongs. JSON has no dates, and neither
+        # has a design: null is refused in their place.
+        return _ADAPTER.validate_json(json.dumps(data, default=lambda date: None), strict=True)
     except ValidationError as error:
         raise from_validation(error, data, schema).renamed(source=source) from None
 

@@ -132,9 +132,13 @@ def simulate(
         )
         if by_force:
             _check_depth(design, press, levels)
-        work.tell(f"light, level {number + 1} of {len(levels)}", 1.0, number)
-        frames.append(_frame(design, inclusion, press, renderer, quality, seed, level))
-    work.tell("done", 1.0, len(levels))
+        stage = "light" if len(levels) == 1 else f"light {number + 1} of {len(levels)}"
+
+        def tell(share: float, stage: str = stage, number: int = number) -> None:
+            work.tell(stage, 1.0, number + share)
+
+        tell(0.0)
+        frames.append(_frame(design, inclusion, press, renderer, quality, seed, level, tell))
     return frames if several else frames[0]
 
 
@@ -194,13 +198,21 @@ def _frame(
     quality: Quality,
     seed: int,
     level: float,
+    tell: Callable[[float], None],
 ) -> Frame:
     start = time.perf_counter()
     camera, wavelength, k = design.camera, design.light.wavelength_nm, design.signal.counts
-    light = int(_random(seed, _LIGHT).generate_state(1)[0])  # the same with and without: their noise cancels
+    # The same with and without the inclusion, so that their noise cancels; 26 bits leave room for the LEDs.
+    light = int(_random(seed, _LIGHT).generate_state(1)[0]) >> 6
 
-    def render(field: str) -> Rendering:
-        return renderer.render(press.surface, field=field, quality=quality, seed=light)
+    def render(field: str, before: float) -> Rendering:
+        return renderer.render(
+            press.surface,
+            field=field,
+            quality=quality,
+            seed=light,
+            progress=lambda share: tell(before + 0.5 * share),
+        )
 
     def expose(rendering: Rendering, purpose: int, frames: int) -> np.ndarray:
         from scenes.camera import expose
@@ -210,10 +222,11 @@ def _frame(
             camera, rendering.radiance.sum(axis=0, dtype=np.float64), wavelength, rng, frames=frames
         )
 
-    lit = render("pressure")
-    unlit = render("pressure_0") if inclusion is not None else lit
+    lit = render("pressure", 0.0)
+    unlit = render("pressure_0", 0.5) if inclusion is not None else lit
     image = expose(lit, _PICTURE, 1)
     reference = expose(unlit, _REFERENCE, REFERENCE_FRAMES).astype(np.float32)
+    tell(1.0)
     return Frame(
         design=design,
         inclusion=inclusion,
