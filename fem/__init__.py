@@ -1,4 +1,4 @@
-"""Contact mechanics of the probe and the tissue: linear elasticity, three-dimensional, nearly incompressible."""
+"""Contact mechanics of probe and tissue: linear elasticity, three-dimensional, nearly incompressible."""
 
 from fem.model import Inclusion, Layer, NotModelled, Probe, Slab
 from fem.press import Press, press

@@ -1,8 +1,9 @@
-"""Stiffness of the 27-node hexahedron that does not lock: quadratic displacement, discontinuous linear pressure.
+"""Stiffness of the 27-node hexahedron that does not lock: quadratic displacement, discontinuous linear
+pressure.
 
-The volumetric stress is sought element by element among 1, x, y, z and condensed out, which leaves a symmetric
-positive definite stiffness in the displacements alone, at any Poisson's ratio below 1/2 (the stable Q2/P1 pair:
-Boffi, Brezzi and Fortin 2013, section 8.6; [boffi2013]).
+The volumetric stress is sought element by element among 1, x, y, z and condensed out, which leaves a
+symmetric positive definite stiffness in the displacements alone, at any Poisson's ratio below 1/2 (the stable
+Q2/P1 pair: Boffi, Brezzi and Fortin 2013, section 8.6; [boffi2013]).
 """
 
 from __future__ import annotations
@@ -35,7 +36,9 @@ def lame(modulus: Floats, poisson: Floats) -> tuple[Floats, Floats]:
     return modulus / (2 * (1 + poisson)), modulus / (3 * (1 - 2 * poisson))
 
 
-def stiffness(mesh: MeshHex2, modulus: Floats, poisson: Floats, elements: NDArray[np.int64] | None = None) -> Floats:
+def stiffness(
+    mesh: MeshHex2, modulus: Floats, poisson: Floats, elements: NDArray[np.int64] | None = None
+) -> Floats:
     """Element stiffness matrices.
 
     Parameters
@@ -76,7 +79,8 @@ def _stiffness(q2: Basis, shear: Floats, bulk: Floats, out: Floats) -> None:
     for a in range(3):
         deviatoric[:, :, a, :, a] += trace
 
-    # volumetric part: bulk * B^T M^-1 B with B = int q_k div u, M = int q_k q_l, q = (1, x, y, z) about the middle
+    # volumetric part: bulk * B^T M^-1 B with B = int q_k div u, M = int q_k q_l, q = (1, x, y, z) about the
+    # middle
     place = np.asarray(q2.global_coordinates())  # (3, n, points)
     place = place - place.mean(axis=2, keepdims=True)
     place = place / np.abs(place).max(axis=2, keepdims=True)

@@ -1,9 +1,10 @@
 """Hexahedra that fit the sphere: topology fixed per resolution, coordinates that morph with the geometry.
 
-The slab is a tensor grid in which a box around the inclusion is replaced by an O-grid (a cubed sphere: a small
-central cube, shells out to the sphere, shells on to the box). All of it lives first in *logical* coordinates,
-where each shell is a concentric cube, and `morph` carries logical to real ones. Sizes, depths and widths
-only enter `morph`, so every inclusion shares one topology, and answers vary smoothly with the geometry.
+The slab is a tensor grid in which a box around the inclusion is replaced by an O-grid (a cubed sphere: a
+small central cube, shells out to the sphere, shells on to the box). All of it lives first in *logical*
+coordinates, where each shell is a concentric cube, and `morph` carries logical to real ones. Sizes, depths
+and widths only enter `morph`, so every inclusion shares one topology, and answers vary smoothly with the
+geometry.
 
 Only the quarter x >= 0, y >= 0 is meshed; logical x and y may be mirrored to get the other quarters.
 """
@@ -39,9 +40,9 @@ class Resolution:
 
 
 QUALITIES = {
-    "preview": Resolution(arc=2, core=1, shell=2, above=1, below=1, edge=2, side=2, layer=1, backing=1),
-    "standard": Resolution(arc=3, core=1, shell=2, above=2, below=2, edge=3, side=3, layer=2, backing=1),
-    "reference": Resolution(arc=4, core=2, shell=3, above=3, below=3, edge=5, side=4, layer=3, backing=2),
+    "preview": Resolution(arc=3, core=1, shell=3, above=2, below=1, edge=2, side=2, layer=1, backing=1),
+    "standard": Resolution(arc=4, core=1, shell=4, above=3, below=2, edge=3, side=4, layer=3, backing=1),
+    "reference": Resolution(arc=5, core=2, shell=5, above=3, below=3, edge=4, side=4, layer=3, backing=2),
 }
 
 
@@ -57,7 +58,7 @@ class Box:
 
 
 def box_around(inclusion: Inclusion | None, probe: Probe, slab: Slab) -> Box:
-    """Place the box; every gap is a smooth function of the geometry and stays inside the slab and footprint."""
+    """Place the box; every gap is a smooth function of the geometry and stays in slab and footprint."""
     half_probe = probe.width_mm / 2
     if inclusion is None:  # any sphere will do: its moduli will be the tissue's
         radius = min(0.15 * slab.thickness_mm, 0.3 * half_probe)
@@ -67,7 +68,9 @@ def box_around(inclusion: Inclusion | None, probe: Probe, slab: Slab) -> Box:
     wish = 1.5 + 0.8 * radius
 
     def gap(room: float) -> float:
-        return (wish**-4 + (0.6 * room) ** -4) ** -0.25  # smooth minimum of the wish and 60 % of the room
+        return (
+            float(wish**-4 + (0.6 * room) ** -4) ** -0.25
+        )  # smooth minimum of the wish and 60 % of the room
 
     return Box(
         radius,
@@ -79,7 +82,7 @@ def box_around(inclusion: Inclusion | None, probe: Probe, slab: Slab) -> Box:
 
 
 def graded(cells: int, ratio: float) -> Floats:
-    """Breakpoints of [0, 1] in `cells` cells, each `ratio` times as long as the one before; shape (cells + 1,)."""
+    """Breakpoints of [0, 1] in `cells` cells, each `ratio` times the one before; shape (cells + 1,)."""
     lengths = ratio ** np.arange(cells)
     return np.concatenate([[0.0], np.cumsum(lengths) / lengths.sum()])
 
@@ -88,7 +91,10 @@ def round_cube(q: Floats) -> Floats:
     """Map the cube [-1, 1]^3 smoothly onto the unit ball, faces onto the sphere; q has shape (3, n)."""
     s = q**2
     return np.stack(
-        [q[i] * np.sqrt(1 - s[j] / 2 - s[k] / 2 + s[j] * s[k] / 3) for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1))]
+        [
+            q[i] * np.sqrt(1 - s[j] / 2 - s[k] / 2 + s[j] * s[k] / 3)
+            for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1))
+        ]
     )
 
 
@@ -133,7 +139,12 @@ def slab_topology(res: Resolution) -> MeshHex2:
     quarter, whole = np.arange(n + 1.0), np.arange(-n, n + 1.0)
     parts.append(_grid(quarter, quarter, whole))
     radial = np.arange(n, reach + 1.0)
-    for axis, sign, u, v in ((0, 1, quarter, whole), (1, 1, quarter, whole), (2, 1, quarter, quarter), (2, -1, quarter, quarter)):
+    for axis, sign, u, v in (
+        (0, 1, quarter, whole),
+        (1, 1, quarter, whole),
+        (2, 1, quarter, quarter),
+        (2, -1, quarter, quarter),
+    ):
         p, t = _grid(radial, u / n, v / n)
         s, pu, pv = p
         q = np.empty_like(p)
@@ -157,7 +168,7 @@ def probe_topology(res: Resolution, layers: int) -> MeshHex2:
 
 
 def _lateral(logical: Floats, res: Resolution, box: Box, probe: Probe, slab: Slab) -> Floats:
-    """x (or y) of the grid lines: even in the box, then shrinking to the probe's edge, then growing to the side."""
+    """x (or y) of grid lines: even in the box, shrinking to the probe's edge, then growing to the side."""
     reach, w, s = res.arc + res.core + res.shell, probe.width_mm / 2, slab.width_mm / 2
     inner = w - (w - box.half) * graded(res.edge, 1.7)[::-1]
     outer = w + (s - w) * graded(res.side, 2.2)
@@ -177,7 +188,9 @@ def morph_slab(res: Resolution, box: Box, probe: Probe, slab: Slab) -> MeshHex2:
     logical = slab_topology(res)
     p = logical.doflocs
     reach = res.arc + res.core + res.shell
-    knots = np.concatenate([-reach - np.arange(res.above, 0, -1.0), [-reach, 0, reach], reach + 1.0 + np.arange(res.below)])
+    knots = np.concatenate(
+        [-reach - np.arange(res.above, 0, -1.0), [-reach, 0, reach], reach + 1.0 + np.arange(res.below)]
+    )
     heights = np.concatenate(
         [
             box.top * np.arange(res.above) / res.above,
@@ -185,7 +198,9 @@ def morph_slab(res: Resolution, box: Box, probe: Probe, slab: Slab) -> MeshHex2:
             box.bottom + (slab.thickness_mm - box.bottom) * graded(res.below, 1.3)[1:],
         ]
     )
-    real = np.stack([*(_lateral(p[i], res, box, probe, slab) for i in (0, 1)), np.interp(p[2], knots, heights)])
+    real = np.stack(
+        [*(_lateral(p[i], res, box, probe, slab) for i in (0, 1)), np.interp(p[2], knots, heights)]
+    )
 
     inside = np.abs(p).max(axis=0) < reach - 1e-9
     q = p[:, inside]
@@ -194,18 +209,26 @@ def morph_slab(res: Resolution, box: Box, probe: Probe, slab: Slab) -> MeshHex2:
     ball = round_cube(q)
     cube = 0.55 * box.radius * (0.5 * q + 0.5 * ball)
     sphere = box.radius * ball
-    wall = np.stack([box.half * q[0], box.half * q[1], np.where(q[2] < 0, box.centre - box.top, box.bottom - box.centre) * q[2]])
+    wall = np.stack(
+        [
+            box.half * q[0],
+            box.half * q[1],
+            np.where(q[2] < 0, box.centre - box.top, box.bottom - box.centre) * q[2],
+        ]
+    )
     rim = res.arc + res.core
     core = np.clip((level - res.arc) / res.core, 0, 1)
     shell = np.interp(level, rim + np.arange(res.shell + 1.0), graded(res.shell, 1.4))
-    local = np.where(level <= rim + 1e-9, (1 - core) * cube + core * sphere, (1 - shell) * sphere + shell * wall)
+    local = np.where(
+        level <= rim + 1e-9, (1 - core) * cube + core * sphere, (1 - shell) * sphere + shell * wall
+    )
     local[2] += box.centre
     real[:, inside] = local
     return _checked(MeshHex2(real, logical.t), "slab")
 
 
 def morph_probe(res: Resolution, box: Box, probe: Probe, slab: Slab) -> MeshHex2:
-    """The probe's mesh in real coordinates (mm), z from -thickness at the glass to 0 at the contact surface."""
+    """The probe's mesh in real coordinates (mm), z from -thickness at the glass to 0 in contact."""
     logical = probe_topology(res, len(probe.layers))
     p = logical.doflocs
     depths = -np.cumsum([0.0] + [layer.thickness_mm for layer in probe.layers])
@@ -217,7 +240,9 @@ def morph_probe(res: Resolution, box: Box, probe: Probe, slab: Slab) -> MeshHex2
 def _checked(mesh: MeshHex2, name: str) -> MeshHex2:
     """Refuse a mesh with an element whose Jacobian is not positive at every node of its Q2 lattice."""
     lattice = MeshHex2().doflocs
-    det = -mesh.mapping().detDF(lattice)  # scikit-fem's reference hexahedron is point-mirrored: upright ones have -1
+    det = -mesh.mapping().detDF(
+        lattice
+    )  # scikit-fem's reference hexahedron is point-mirrored: upright ones have -1
     if det.min() <= 0:
         cell = int(det.min(axis=1).argmin())
         x, y, z = mesh.p[:, mesh.t[:, cell]].mean(axis=1)
@@ -232,10 +257,10 @@ def slab_materials(res: Resolution) -> Ints:
     """Material of each slab element: 1 inside the sphere, else 0; shape (elements,)."""
     logical = slab_topology(res)
     level = np.abs(logical.p[:, logical.t].mean(axis=1)).max(axis=0)
-    return (level < res.arc + res.core).astype(np.int64)
+    return np.asarray(level < res.arc + res.core, dtype=np.int64)
 
 
 def probe_materials(res: Resolution, layers: int) -> Ints:
     """Material of each probe element: 2 for the contact layer, 3 for the next, ...; shape (elements,)."""
     logical = probe_topology(res, layers)
-    return 2 + np.floor(-logical.p[2, logical.t].mean(axis=0)).astype(np.int64)
+    return np.asarray(2 + np.floor(-logical.p[2, logical.t].mean(axis=0)), dtype=np.int64)

@@ -18,7 +18,7 @@ Poisson = Annotated[float, Field(ge=0, le=0.4999, description="Poisson's ratio; 
 
 
 class NotModelled(ValueError):
-    """Physics that this version does not model (off-centre inclusions, contact that opens): one line says which."""
+    """Physics that this version does not model, such as contact that opens: one line says which."""
 
 
 @dataclass(frozen=True, config=_STRICT)
@@ -32,7 +32,7 @@ class Layer:
 
 @dataclass(frozen=True, config=_STRICT)
 class Probe:
-    """Square layered waveguide on rigid glass; `layers` run from the contact side, the last is bonded to the glass."""
+    """Square layered waveguide; `layers` run from the contact side, the last is bonded to rigid glass."""
 
     width_mm: Annotated[float, Field(gt=0, description="side of the square contact surface, mm")]
     layers: Annotated[tuple[Layer, ...], Field(min_length=1, description="layers from the contact side")]
@@ -46,7 +46,9 @@ class Probe:
 class Slab:
     """Square tissue slab, sides free, its far face fully fixed to the chest wall at z = thickness."""
 
-    thickness_mm: Annotated[float, Field(gt=0, description="thickness from contact surface to chest wall, mm")]
+    thickness_mm: Annotated[
+        float, Field(gt=0, description="thickness from contact surface to chest wall, mm")
+    ]
     width_mm: Annotated[float, Field(gt=0, description="side of the square slab, mm")]
     modulus_kPa: Modulus
     poisson: Poisson = 0.49
@@ -96,7 +98,8 @@ def check(probe: Probe, slab: Slab, inclusion: Inclusion | None) -> None:
     if inclusion.offset != (0.0, 0.0):
         x, y = inclusion.offset
         raise NotModelled(
-            f"inclusion.offset: received ({x:g}, {y:g}) mm; not modelled yet: off-centre inclusions, allowed (0, 0)"
+            f"inclusion.offset: received ({x:g}, {y:g}) mm; "
+            "not modelled yet: off-centre inclusions, allowed (0, 0)"
         )
     widest = 0.9 * probe.width_mm
     if inclusion.size > widest:

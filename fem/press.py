@@ -28,18 +28,21 @@ class Press:
     ----------
     surface
         The whole contact surface: undeformed points (n, 3) mm, quads on all Q2 nodes, and of each point
-        `displacement` (n, 3) mm of the probe, in its frame, +z into the specimen, so that pushed in is negative;
-        `pressure` (n,) kPa, compression positive; `displacement_0`, `pressure_0`; and the lumped `area` (n,) mm²:
-        `pressure * area` sums to the force.
+        `displacement` (n, 3) mm of the probe, in its frame, +z into the specimen, so that pushed in is
+        negative; `pressure` (n,) kPa, compression positive (see `fem.surface.pressure`); `displacement_0`,
+        `pressure_0`; and the lumped `area` (n,) mm²: `pressure * area` sums to the force.
     cut
-        The plane y = 0 of probe and slab: `displacement`, `displacement_0` (n, 3) mm, in the probe's frame, so that the
-        chest wall moves by -indentation; cells' `material`: 0 tissue, 1 inclusion, 2, 3, ... layers from the contact side.
+        The plane y = 0 of probe and slab: `displacement`, `displacement_0` (n, 3) mm, in the probe's frame,
+        so that the chest wall moves by -indentation; cells' `material`: 0 tissue, 1 inclusion, 2, 3, ...
+        layers from the contact side.
     indentation_mm, indentation_0_mm
         Travel of the glass against the chest wall; they differ when pressed by force.
     force_N, force_0_N, chest_force_N
-        Force on the contact surface, the same without inclusion, and the chest wall's reaction; compression positive.
+        Force on the contact surface, the same without inclusion, and the chest wall's reaction; compression
+        positive.
     min_pressure_kPa
-        The smallest contact pressure of the two states; always positive, or the press would have been refused.
+        The smallest contact pressure of the two states; always positive, or the press would have been
+        refused.
     dof, seconds
         Unknowns and time taken.
     path
@@ -98,7 +101,9 @@ def press(
     """
     start = time.perf_counter()
     if (indentation is None) == (force is None):
-        raise ValueError(f"indentation, force: received {indentation} and {force}; allowed exactly one of the two")
+        raise ValueError(
+            f"indentation, force: received {indentation} and {force}; allowed exactly one of the two"
+        )
     name, amount = ("indentation", indentation) if force is None else ("force", force)
     assert amount is not None
     if not (np.isfinite(amount) and amount > 0):
@@ -106,10 +111,11 @@ def press(
     if quality not in mesh.QUALITIES:
         raise ValueError(f"quality: received {quality!r}; allowed {', '.join(mesh.QUALITIES)}")
     check(probe, slab, inclusion)
+    res = mesh.QUALITIES[quality]
 
     key = (probe, slab, inclusion, quality)
     if key not in _memory:
-        found = solve(probe, slab, inclusion, mesh.QUALITIES[quality], progress or (lambda stage, fraction: None))
+        found = solve(probe, slab, inclusion, res, progress or (lambda stage, fraction: None))
         _memory.clear()
         _memory[key] = found
     solution = _memory[key]
@@ -119,15 +125,18 @@ def press(
         scales = amount, amount
     else:
         scales = (1e3 * amount / _force(units[0]), 1e3 * amount / _force(units[1]))
-    contact, lowest = _contact(solution, scales)
+    contact, lowest = _contact(solution, scales, res.edge)
     sys = solution.system
-    faces, elements = surface.cut_faces(mesh.slab_topology(mesh.QUALITIES[quality]))
-    probe_faces, probe_elements = surface.cut_faces(mesh.probe_topology(mesh.QUALITIES[quality], len(probe.layers)))
+    faces, elements = surface.cut_faces(mesh.slab_topology(res))
+    probe_faces, probe_elements = surface.cut_faces(mesh.probe_topology(res, len(probe.layers)))
     cut = surface.cut_plane(
         solution.place,
         np.vstack([faces, probe_faces + sys.slab_nodes]),
         sys.material[np.concatenate([elements, probe_elements + sys.slab_elements])],
-        {n: s * u.displacement for n, s, u in zip(("displacement", "displacement_0"), scales, units, strict=True)},
+        {
+            n: s * u.displacement
+            for n, s, u in zip(("displacement", "displacement_0"), scales, units, strict=True)
+        },
     )
     return Press(
         contact,
@@ -148,21 +157,22 @@ def _force(unit: Unit) -> float:
     return 4 * float(unit.reaction.sum())
 
 
-def _contact(solution: Solution, scales: tuple[float, float]) -> tuple[pv.PolyData, float]:
+def _contact(solution: Solution, scales: tuple[float, float], edge: int) -> tuple[pv.PolyData, float]:
     """The contact surface with its fields, and the smallest pressure on it, kPa."""
     sys = solution.system
     x, y = solution.place[sys.tip[:, 0], 0], solution.place[sys.tip[0], 1]
     contact = surface.contact_surface(surface.mirror_line(x), surface.mirror_line(y))
-    area = np.outer(surface.line_weights(x), surface.line_weights(y))
     lowest = np.inf
-    for suffix, scale, unit in zip(("", "_0"), scales, (solution.with_inclusion, solution.without), strict=True):
+    for suffix, scale, unit in zip(
+        ("", "_0"), scales, (solution.with_inclusion, solution.without), strict=True
+    ):
         moved = scale * unit.displacement[sys.tip]
-        pressure = scale * unit.reaction / area
+        pressure = surface.pressure(scale * unit.reaction, x, y, edge)
         if pressure.min() <= 0:
             i, j = np.unravel_index(int(pressure.argmin()), pressure.shape)
             raise NotModelled(
-                f"press: received a contact that opens, {pressure.min():.3g} kPa at ({x[i]:.2f}, {y[j]:.2f}) mm; "
-                "not modelled yet: allowed are presses that stay in contact everywhere"
+                f"press: received a contact that opens, {pressure.min():.3g} kPa "
+                f"at ({x[i]:.2f}, {y[j]:.2f}) mm; not modelled yet: allowed are presses that stay in contact everywhere"
             )
         lowest = min(lowest, float(pressure.min()))
         signs = ((-1, 1), (1, -1), (1, 1))

@@ -17,18 +17,22 @@ def scalars(surface: pv.PolyData, threshold_um: float) -> dict[str, dict[str, fl
     Parameters
     ----------
     surface
-        From `press`: quads four to a nine-node face, `displacement` and `displacement_0` (n, 3) mm, `area` (n,) mm².
+        From `press`: quads four to a nine-node face, `displacement` and `displacement_0` (n, 3) mm, `area`
+        (n,) mm².
     threshold_um
         The k of the design, µm of displacement; `area` counts where the signal exceeds it.
 
     Returns
     -------
-    {"raw": {...}, "tared": {...}}, each with `max_mm`, the largest displacement; `total_mm3`, its integral over
-    the whole surface; `area_mm2`, where it exceeds the threshold. Pushed in is positive.
+    {"raw": {...}, "tared": {...}}, each with `max_mm`, the largest displacement; `total_mm3`, its integral
+    over the whole surface; `area_mm2`, where it exceeds the threshold. Pushed in is positive.
     """
     raw = -np.asarray(surface.point_data["displacement"])[:, 2]
     tared = raw + np.asarray(surface.point_data["displacement_0"])[:, 2]
-    return {name: _three(surface, signal, threshold_um * 1e-3) for name, signal in (("raw", raw), ("tared", tared))}
+    return {
+        name: _three(surface, signal, threshold_um * 1e-3)
+        for name, signal in (("raw", raw), ("tared", tared))
+    }
 
 
 def _three(surface: pv.PolyData, signal: Floats, threshold: float) -> dict[str, float]:
@@ -60,7 +64,7 @@ def _refine(nodal: Floats) -> Floats:
 
 
 def _above(corners: Floats, threshold: float) -> Floats:
-    """Share of each small cell above the threshold, the field taken linear on its two triangles; (m, fine, fine)."""
+    """Share of each small cell above the threshold, the field linear on its two triangles; (m, fine, fine)."""
     f = corners - threshold
     a, b, c, d = f[:, :-1, :-1], f[:, 1:, :-1], f[:, :-1, 1:], f[:, 1:, 1:]
     return 0.5 * (_share(a, b, d) + _share(a, c, d))

@@ -1,12 +1,13 @@
 """Direct solver for symmetric positive definite finite elements: nested dissection over the element tree.
 
-The elements are halved again and again; on the way up, each union of two halves eliminates the unknowns that no
-other element shares (multifrontal Cholesky: Duff and Reid 1983; [duff1983]). Element matrices go straight
+The elements are halved again and again; on the way up, each union of two halves eliminates the unknowns that
+no other element shares (multifrontal Cholesky: Duff and Reid 1983; [duff1983]). Element matrices go straight
 into dense fronts, no global matrix is ever assembled. LAPACK does the work, so nothing but SciPy is needed.
 
 Two habits make this the right solver here. A set of elements may be kept for the very top of the tree (the
 inclusion): nothing below depends on their stiffness, so it is factored once for all moduli. And the order of
-every sum is fixed by the tree, with single-threaded BLAS inside, so the bytes do not depend on the number of threads.
+every sum is fixed by the tree, with single-threaded BLAS inside, so the bytes do not depend on the number of
+threads.
 """
 
 from __future__ import annotations
@@ -153,13 +154,18 @@ class Factor:
     matrices
         Symmetric element matrices, shape (elements, k, k).
     base
-        A factor of the same tree whose matrices differ only in the elements kept for last: all the rest is shared.
+        A factor of the same tree whose matrices differ only in the elements kept for last: all the rest is
+        shared.
     progress
         Called with the fraction done.
     """
 
     def __init__(
-        self, tree: Tree, matrices: Floats, base: Factor | None = None, progress: Callable[[float], None] | None = None
+        self,
+        tree: Tree,
+        matrices: Floats,
+        base: Factor | None = None,
+        progress: Callable[[float], None] | None = None,
     ):
         self.tree, self.matrices = tree, matrices
         self.lower: list[tuple[Floats, Floats]] = []  # L11 (p, p) and L21 (b, p) of each front
@@ -186,7 +192,9 @@ class Factor:
         p, b = front.pivots, len(front.dofs) - front.pivots
         a11, a21, a22 = (np.zeros(shape, order="F") for shape in ((p, p), (b, p), (b, b)))
         if len(front.elements):
-            blocks = [self.matrices[e][np.ix_(k, k)] for e, k in zip(front.elements, front.local, strict=True)]
+            blocks = [
+                self.matrices[e][np.ix_(k, k)] for e, k in zip(front.elements, front.local, strict=True)
+            ]
         else:
             blocks = [self._stay[c] if c in self._stay else pending.pop(c) for c in front.children]
         for block, where in zip(blocks, front.where, strict=True):
@@ -204,7 +212,9 @@ class Factor:
             return a22
         l11, info = lapack.dpotrf(a11, lower=1, clean=0, overwrite_a=1)
         if info != 0:
-            raise np.linalg.LinAlgError(f"stiffness is not positive definite (pivot {info} of a front of {p})")
+            raise np.linalg.LinAlgError(
+                f"stiffness is not positive definite (pivot {info} of a front of {p})"
+            )
         if b == 0:
             self.lower.append((l11, a21))
             return a22
@@ -241,4 +251,4 @@ def apply(tree: Tree, matrices: Floats, x: Floats) -> Floats:
     local = np.append(x, 0.0)[tree.dofs]
     force = (matrices @ local[:, :, None])[:, :, 0]
     free = tree.dofs >= 0
-    return np.bincount(tree.dofs[free], weights=force[free], minlength=tree.size)
+    return np.asarray(np.bincount(tree.dofs[free], weights=force[free], minlength=tree.size), dtype=float)

@@ -1,9 +1,9 @@
 """The unknowns of a press: which node moves how, what is tied, what is held; and its unit solution.
 
-The probe and the slab are two meshes. Frictionless contact that stays closed is a tie of the normal displacement
-alone: the probe's contact nodes share their z unknown with the slab's nodes under them, x and y stay
-free of each other. Everything is solved in the probe's frame for one millimetre of indentation: the glass at
-rest, the chest wall moving by -1 mm in z; linear elasticity scales the rest.
+The probe and the slab are two meshes. Frictionless contact that stays closed is a tie of the normal
+displacement alone: the probe's contact nodes share their z unknown with the slab's nodes under them, x and y
+stay free of each other. Everything is solved in the probe's frame for one millimetre of indentation: the
+glass at rest, the chest wall moving by -1 mm in z; linear elasticity scales the rest.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class System:
-    """Topology of a press; depends on the resolution and the number of layers only. Probe nodes follow slab nodes."""
+    """Topology of a press; fixed by resolution and number of layers. Probe nodes follow slab nodes."""
 
     local: Ints  # dof 3 * node + axis of each element's local dofs; (elements, 81)
     dofs: Ints  # its unknown, -1 where held; (elements, 81)
@@ -68,7 +68,9 @@ def system(res: Resolution, layers: int) -> System:
     local = np.vstack([elasticity.element_dofs(slab), elasticity.element_dofs(probe) + 3 * split])
     material = np.concatenate([mesh.slab_materials(res), mesh.probe_materials(res, layers)])
     drop = slab.p[2].min()  # hang the probe on the slab, so that neighbours are neighbours
-    centres = np.hstack([m.p[:, m.t].mean(axis=1) + [[0], [0], [dz]] for m, dz in ((slab, 0.0), (probe, drop))]).T
+    middles = [m.p[:, m.t].mean(axis=1) for m in (slab, probe)]
+    middles[1][2] += drop
+    centres = np.hstack(middles).T
     tree = solver.plan(unknown[local], centres, material == 1)
     return System(local, unknown[local], unknown, chest, contact, tip, material, slab.t.shape[1], split, tree)
 
@@ -156,10 +158,10 @@ def _unit(sys: System, factor: solver.Factor) -> Unit:
 
 
 def _scatter(sys: System, matrices: Floats, full: Floats) -> tuple[Floats, Floats]:
-    """Internal forces of a displacement: on the unknowns, (unknowns,), and of the slab alone on its nodes, (nodes, 3)."""
+    """Internal forces of a displacement: on the unknowns (unknowns,), of the slab alone on its nodes (nodes, 3)."""
     force = (matrices @ full[sys.local][:, :, None])[:, :, 0]
     free = sys.dofs >= 0
     total = np.bincount(sys.dofs[free], weights=force[free], minlength=sys.tree.size)
     cut = sys.slab_elements
     slab = np.bincount(sys.local[:cut].ravel(), weights=force[:cut].ravel(), minlength=3 * sys.slab_nodes)
-    return total, slab.reshape(-1, 3)
+    return np.asarray(total, dtype=float), np.asarray(slab, dtype=float).reshape(-1, 3)
