@@ -1,6 +1,10 @@
 """The chain from press to picture, at preview quality: seeds, levels, taring, what a frame says of itself."""
 
 import dataclasses
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +13,7 @@ import fem
 import twin
 from estimation import scalars
 
+HERE = Path(__file__).resolve().parent
 INCLUSION = twin.Inclusion(size=10, depth=5, modulus=100)
 
 
@@ -47,6 +52,29 @@ def test_a_level_does_not_depend_on_the_others_and_a_seed_gives_the_same_bytes(d
         assert getattr(alone, name).tobytes() == getattr(levels[1], name).tobytes(), name
     for name in ("displacement", "pressure", "displacement_0", "pressure_0"):
         assert alone.surface.point_data[name].tobytes() == levels[1].surface.point_data[name].tobytes(), name
+
+
+HASHES = """
+import hashlib, sys
+sys.path[:0] = sys.argv[2:]
+from scenes import backend
+from test_simulate import INCLUSION, small, twin
+backend.use("auto")
+backend.threads(int(sys.argv[1]))
+frame = twin.simulate(small(), INCLUSION, 2.0, quality="preview", seed=7)
+arrays = [frame.image, frame.reference, frame.radiance, *frame.surface.point_data.values()]
+print(*(hashlib.sha256(array.tobytes()).hexdigest() for array in arrays))
+"""
+
+
+def test_one_thread_and_two_give_the_same_bytes():
+    found = set()
+    for threads in ("1", "2"):
+        environment = {**os.environ, "OMP_NUM_THREADS": threads, "OPENBLAS_NUM_THREADS": threads}
+        command = [sys.executable, "-c", HASHES, threads, str(HERE), str(HERE.parent)]
+        ended = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+        found.add(ended.stdout)
+    assert len(found) == 1 and len(found.pop().split()) >= 7
 
 
 def test_another_seed_gives_other_noise_in_light_and_camera(design, levels):

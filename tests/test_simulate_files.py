@@ -19,6 +19,12 @@ FRAME_KEYS = {"inclusion", "press", "fem", "tsis", "design", "seed", "versions",
 RUN = ["simulate", "--size", "10", "--depth", "5", "--modulus", "100", "--out", "out"]
 
 
+@pytest.fixture
+def plain_sheet(monkeypatch):
+    """Draw no sheet where a test is not about it: it takes seconds."""
+    monkeypatch.setattr("twin.pictures.overview", lambda frame, path: path.write_bytes(b"sheet"))
+
+
 @pytest.fixture(scope="module")
 def frame():
     return twin.simulate(small(), INCLUSION, 2.0, quality="preview", seed=7)
@@ -72,7 +78,7 @@ def test_the_same_seed_writes_the_same_bytes(folder, tmp_path):
         assert (again / name).read_bytes() == (folder / name).read_bytes(), name
 
 
-def test_several_frames_go_into_numbered_folders_and_replace_an_earlier_result(frame, tmp_path):
+def test_several_frames_go_into_numbered_folders_and_replace_an_earlier_result(frame, tmp_path, plain_sheet):
     out = tmp_path / "levels"
     frame.write(out)
     write_frames([frame, frame], out)
@@ -83,7 +89,7 @@ def test_several_frames_go_into_numbered_folders_and_replace_an_earlier_result(f
     assert list(tmp_path.iterdir()) == [out]
 
 
-def test_a_folder_with_anything_else_is_left_alone(frame, tmp_path):
+def test_a_folder_with_anything_else_is_left_alone(frame, tmp_path, plain_sheet):
     out = frame.write(tmp_path / "out")
     (out / "notes.txt").write_text("mine")
     before = {path: path.read_bytes() for path in out.iterdir()}
@@ -117,7 +123,7 @@ def fill_the_disk(*args, **options):
 @pytest.mark.parametrize(("accident", "status"), [(interrupt, 130), (terminate, 130), (fill_the_disk, 1)])
 @pytest.mark.parametrize("earlier", [False, True])
 def test_an_accident_leaves_nothing_new_behind(
-    accident, status, earlier, frame, tmp_path, monkeypatch, capfd
+    accident, status, earlier, frame, tmp_path, monkeypatch, capfd, plain_sheet
 ):
     monkeypatch.chdir(tmp_path)
     out = tmp_path / "out"
@@ -133,7 +139,7 @@ def test_an_accident_leaves_nothing_new_behind(
     assert "nothing was written" in error[-1] and not any("Traceback" in line for line in error)
 
 
-def test_the_command_line_writes_what_python_returns(frame, tmp_path, monkeypatch, capfd):
+def test_the_command_line_writes_what_python_returns(frame, tmp_path, monkeypatch, capfd, plain_sheet):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(twin.cli, "simulate", lambda *args, **options: [frame, frame])
     assert twin.cli.main([*RUN, "--indentation", "1", "2"]) == 0
