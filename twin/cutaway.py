@@ -48,7 +48,7 @@ def draw_cut(axes: Axes, frame: Pictured, letter: str) -> None:
         corner = (min(sign * face, sign * (face + 0.8)), led.z_mm - led.diameter_mm / 2)
         axes.add_patch(Rectangle(corner, 0.8, led.diameter_mm, facecolor=LED, zorder=4, **edge))
     _name_the_parts(axes, frame, bottom, wall)
-    axes.set_xlim(-wide - 4, wide + 4)
+    axes.set_xlim(-wide - 3, wide + 6)
     axes.set_ylim(bottom - glass - 2.6, slab.thickness_mm + 1.5)
     axes.set_aspect("equal", anchor="N")
     axes.set_xlabel("x, mm")
