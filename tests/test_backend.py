@@ -204,9 +204,9 @@ def test_fetch_without_apt_says_what_to_install(tmp_path: Path, monkeypatch: pyt
 def test_command_line_refuses_a_bad_llvm(tmp_path: Path) -> None:
     """What a user sees: exit status 2, one line with what to install, and no half-made folder."""
     place("libLLVM-15.so.1", tmp_path)
-    words = "simulate tsis --size 10 --depth 5 --modulus 100 --device cpu --quality preview --out".split()
+    words = ["simulate", "tsis", "--size", "10", "--depth", "5", "--modulus", "100", "--device", "cpu"]
     done = subprocess.run(
-        [sys.executable, "-m", "twin", *words, str(tmp_path / "out")],
+        [sys.executable, "-m", "twin", *words, "--out", str(tmp_path / "out")],
         env={key: value for key, value in os.environ.items() if key != "DRJIT_LIBLLVM_PATH"}
         | {"TWIN_LLVM_DIRS": str(tmp_path)},
         cwd=ROOT,
