@@ -68,9 +68,8 @@ def box_around(inclusion: Inclusion | None, probe: Probe, slab: Slab) -> Box:
     wish = 1.5 + 0.8 * radius
 
     def gap(room: float) -> float:
-        return (
-            float(wish**-4 + (0.6 * room) ** -4) ** -0.25
-        )  # smooth minimum of the wish and 60 % of the room
+        # a smooth minimum of the wish and 60 % of the room
+        return float((wish**-4 + (0.6 * room) ** -4) ** -0.25)
 
     return Box(
         radius,

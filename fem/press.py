@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pyvista as pv
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from fem import mesh, surface
 from fem.model import Inclusion, NotModelled, Probe, Slab, check
+from fem.solver import one_thread
 from fem.system import Solution, Unit, solve
 
 Floats = NDArray[np.float64]
@@ -112,10 +113,13 @@ def press(
         raise ValueError(f"quality: received {quality!r}; allowed {', '.join(mesh.QUALITIES)}")
     check(probe, slab, inclusion)
     res = mesh.QUALITIES[quality]
+    if probe.width_mm == slab.width_mm:
+        res = replace(res, side=0)
 
     key = (probe, slab, inclusion, quality)
     if key not in _memory:
-        found = solve(probe, slab, inclusion, res, progress or (lambda stage, fraction: None))
+        with one_thread():
+            found = solve(probe, slab, inclusion, res, progress or (lambda stage, fraction: None))
         _memory.clear()
         _memory[key] = found
     solution = _memory[key]
@@ -125,7 +129,8 @@ def press(
         scales = amount, amount
     else:
         scales = (1e3 * amount / _force(units[0]), 1e3 * amount / _force(units[1]))
-    contact, lowest = _contact(solution, scales, res.edge)
+    with one_thread():
+        contact, lowest = _contact(solution, scales, res.edge)
     sys = solution.system
     faces, elements = surface.cut_faces(mesh.slab_topology(res))
     probe_faces, probe_elements = surface.cut_faces(mesh.probe_topology(res, len(probe.layers)))
@@ -172,7 +177,7 @@ def _contact(solution: Solution, scales: tuple[float, float], edge: int) -> tupl
             i, j = np.unravel_index(int(pressure.argmin()), pressure.shape)
             raise NotModelled(
                 f"press: received a contact that opens, {pressure.min():.3g} kPa "
-                f"at ({x[i]:.2f}, {y[j]:.2f}) mm; not modelled yet: allowed are presses that stay in contact everywhere"
+                f"at ({x[i]:.2f}, {y[j]:.2f}) mm; not modelled yet: allowed is contact that stays closed"
             )
         lowest = min(lowest, float(pressure.min()))
         signs = ((-1, 1), (1, -1), (1, 1))

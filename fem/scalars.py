@@ -44,8 +44,8 @@ def _three(surface: pv.PolyData, signal: Floats, threshold: float) -> dict[str, 
     # the lumped areas are Simpson's weights, which integrate a biquadratic field exactly
     return {
         "max_mm": float(fine.max()),
-        "total_mm3": float(np.asarray(surface.point_data["area"]) @ signal),
-        "area_mm2": float(size @ share),
+        "total_mm3": float((np.asarray(surface.point_data["area"]) * signal).sum()),
+        "area_mm2": float((size * share).sum()),
     }
 
 
@@ -64,7 +64,7 @@ def _refine(nodal: Floats) -> Floats:
 
 
 def _above(corners: Floats, threshold: float) -> Floats:
-    """Share of each small cell above the threshold, the field linear on its two triangles; (m, fine, fine)."""
+    """Share of each small cell above the threshold, linear on its two triangles; (m, fine, fine)."""
     f = corners - threshold
     a, b, c, d = f[:, :-1, :-1], f[:, 1:, :-1], f[:, :-1, 1:], f[:, 1:, 1:]
     return 0.5 * (_share(a, b, d) + _share(a, c, d))

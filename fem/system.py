@@ -108,7 +108,7 @@ def solve(
     res: Resolution,
     progress: Callable[[str, float], None] = lambda stage, fraction: None,
 ) -> Solution:
-    """Solve with and without the inclusion on the mesh that fits it."""
+    """Solve with and without the inclusion on the mesh that fits it; call it under `solver.one_thread`."""
     progress("mesh", 0.0)
     box = mesh.box_around(inclusion, probe, slab)
     slab_mesh, probe_mesh = mesh.morph_slab(res, box, probe, slab), mesh.morph_probe(res, box, probe, slab)
@@ -120,13 +120,8 @@ def solve(
     modulus = np.array([slab.modulus_kPa, slab.modulus_kPa, *(layer.modulus_kPa for layer in probe.layers)])
     poisson = np.array([slab.poisson, slab.poisson, *(layer.poisson for layer in probe.layers)])
     cut = sys.slab_elements
-    with solver.one_thread():
-        matrices = np.concatenate(
-            [
-                elasticity.stiffness(m, modulus[of], poisson[of])
-                for m, of in ((slab_mesh, sys.material[:cut]), (probe_mesh, sys.material[cut:]))
-            ]
-        )
+    parts = ((slab_mesh, sys.material[:cut]), (probe_mesh, sys.material[cut:]))
+    matrices = np.concatenate([elasticity.stiffness(m, modulus[of], poisson[of]) for m, of in parts])
     progress("factorise", 0.25)
     factor = solver.Factor(sys.tree, matrices, progress=lambda f: progress("factorise", 0.25 + 0.6 * f))
     progress("solve", 0.85)
@@ -137,9 +132,8 @@ def solve(
     progress("inclusion", 0.9)
     ball = np.flatnonzero(sys.material == 1)
     stiff = np.full(len(ball), inclusion.modulus), np.full(len(ball), inclusion.poisson)
-    with solver.one_thread():
-        matrices = matrices.copy()
-        matrices[ball] = elasticity.stiffness(slab_mesh, *stiff, elements=ball)
+    matrices = matrices.copy()
+    matrices[ball] = elasticity.stiffness(slab_mesh, *stiff, elements=ball)
     unit = _unit(sys, solver.Factor(sys.tree, matrices, base=factor))
     progress("done", 1.0)
     return Solution(sys, place, unit, without)
@@ -149,16 +143,14 @@ def _unit(sys: System, factor: solver.Factor) -> Unit:
     """Lower the chest wall by one millimetre onto the probe."""
     held = np.zeros(len(sys.unknown))
     held[3 * sys.chest + 2] = -1.0
-    with solver.one_thread():
-        load = -_scatter(sys, factor.matrices, held)[0]
-        x = factor.solve(load)
-        full = np.where(sys.unknown >= 0, np.append(x, 0.0)[sys.unknown], held)
-        force = _scatter(sys, factor.matrices, full)[1]
+    x = factor.solve(-_scatter(sys, factor.matrices, held)[0])
+    full = np.where(sys.unknown >= 0, np.append(x, 0.0)[sys.unknown], held)
+    force = _scatter(sys, factor.matrices, full)[1]
     return Unit(full.reshape(-1, 3), force[sys.contact, 2], -float(force[sys.chest, 2].sum()))
 
 
 def _scatter(sys: System, matrices: Floats, full: Floats) -> tuple[Floats, Floats]:
-    """Internal forces of a displacement: on the unknowns (unknowns,), of the slab alone on its nodes (nodes, 3)."""
+    """Internal forces of a displacement: on the unknowns (unknowns,), of the slab on its nodes (nodes, 3)."""
     force = (matrices @ full[sys.local][:, :, None])[:, :, 0]
     free = sys.dofs >= 0
     total = np.bincount(sys.dofs[free], weights=force[free], minlength=sys.tree.size)
