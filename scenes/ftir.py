@@ -72,9 +72,10 @@ def gap_transmittance(
     s2 = _sine_squared_over(w, 2e3 * np.pi * gap / wavelength)
     t_s = 4.0 * q1 * q3 / ((q1 + q3) ** 2 + s2 * (i1**2 - i0**2) * (i3**2 - i0**2))
 
-    y1, y3 = i1**2 / q1, i3**2 / q3
-    i04 = i0**4
-    t_p = 4.0 * y1 * y3 / ((y1 + y3) ** 2 + s2 / i04 * (y1**2 * w - i04) * (y3**2 * w - i04))
+    # multiplied through by (q1 q3)², so that grazing light (q = 0) does not overflow
+    i12, i32, i04 = i1**2, i3**2, i0**4
+    t_p = 4.0 * i12 * i32 * q1 * q3
+    t_p /= (i12 * q3 + i32 * q1) ** 2 + s2 / i04 * (i12**2 * w - i04 * q1**2) * (i32**2 * w - i04 * q3**2)
     return np.where(open_, t_s, 0.0), np.where(open_, t_p, 0.0)
 
 
