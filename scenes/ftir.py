@@ -18,15 +18,16 @@ def gap_transmittance(
 ) -> tuple[Array, Array]:
     """Power transmittance of a lossless gap, s and p polarised, all interference included.
 
-    Light in medium `n1` (the guide) meets a gap of index `n0` and thickness `gap_um`, behind it medium `n3` (the tissue).
-    Closed form of the three-layer characteristic matrix (Yeh 1988, ch. 4 and 5; key yeh1988), with
-    q = n cos(theta), w = n0² - n1² sin²(theta), a = 2 pi g / lambda and S² = sin²(a sqrt(w)) / w:
+    Light in medium `n1` (the guide) meets a gap of index `n0` and thickness `gap_um`, behind it medium `n3`
+    (the tissue). Closed form of the three-layer characteristic matrix (Yeh 1988, ch. 4 and 5; key yeh1988),
+    with q = n cos(theta), w = n0² - n1² sin²(theta), a = 2 pi g / lambda and S² = sin²(a sqrt(w)) / w:
 
         T_s = 4 q1 q3 / [(q1 + q3)² + S² (n1² - n0²)(n3² - n0²)]
         T_p = 4 y1 y3 / [(y1 + y3)² + (S² / n0⁴)(y1² w - n0⁴)(y3² w - n0⁴)],   y = n² / q
 
-    Below the critical angle of the gap w > 0 (Fabry-Pérot fringes); beyond it w < 0 and S² = sinh²(a sqrt(-w)) / (-w): the
-    evanescent wave tunnels. Where `n3` itself admits no propagating wave (n1 sin(theta) > n3) both are zero.
+    Below the critical angle of the gap w > 0 (Fabry-Pérot fringes); beyond it w < 0 and
+    S² = sinh²(a sqrt(-w)) / (-w): the evanescent wave tunnels. Where `n3`
+    itself admits no propagating wave (n1 sin(theta) > n3) both are zero.
 
     Parameters
     ----------
@@ -72,16 +73,17 @@ def gap_transmittance(
     s2 = _sine_squared_over(w, 2e3 * np.pi * gap / wavelength)
     t_s = 4.0 * q1 * q3 / ((q1 + q3) ** 2 + s2 * (i1**2 - i0**2) * (i3**2 - i0**2))
 
-    y1, y3 = i1**2 / q1, i3**2 / q3
-    i04 = i0**4
-    t_p = 4.0 * y1 * y3 / ((y1 + y3) ** 2 + s2 / i04 * (y1**2 * w - i04) * (y3**2 * w - i04))
+    # multiplied through by (q1 q3)², so that grazing light (q = 0) does not overflow
+    i12, i32, i04 = i1**2, i3**2, i0**4
+    t_p = 4.0 * i12 * i32 * q1 * q3
+    t_p /= (i12 * q3 + i32 * q1) ** 2 + s2 / i04 * (i12**2 * w - i04 * q1**2) * (i32**2 * w - i04 * q3**2)
     return np.where(open_, t_s, 0.0), np.where(open_, t_p, 0.0)
 
 
 def _sine_squared_over(w: Array, a: Array) -> Array:
     """S² = sin²(a sqrt(w)) / w, continued through w = 0 (a²) into sinh²(a sqrt(-w)) / (-w)."""
     x = a * np.sqrt(np.abs(w))
-    x_capped = np.minimum(x, 300.0)  # sinh² beyond this is > 1e259: the transmittance is 0 in double precision
+    x_capped = np.minimum(x, 300.0)  # sinh² beyond this is > 1e259: the transmittance is 0
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(w > 0.0, np.sin(x), np.sinh(x_capped)) / x
     return a**2 * np.where(x > 1e-8, ratio, 1.0) ** 2
@@ -100,4 +102,6 @@ def _check(arrays: dict[str, Array]) -> None:
         bad = ~((arrays[name] >= low) & (arrays[name] <= high) & np.isfinite(arrays[name]))
         if np.any(bad):
             received = arrays[name][bad].flat[0]
-            raise ValueError(f"gap_transmittance: {name}: received {received}; allowed {low:g} to {high:g}, finite")
+            raise ValueError(
+                f"gap_transmittance: {name}: received {received}; allowed {low:g} to {high:g}, finite"
+            )
