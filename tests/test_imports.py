@@ -15,7 +15,7 @@ ALLOWED = {
     "assets": set(),
     "estimation": {"numpy", "scipy", "torch"},
     "fem": {"numpy", "pydantic", "pyvista", "scipy", "skfem", "threadpoolctl"},
-    "scenes": {"drjit", "mitsuba", "numpy", "OpenEXR", "PIL", "pydantic", "pyvista", "scipy", "trimesh"},
+    "scenes": {"drjit", "mitsuba", "numpy", "OpenEXR", "PIL", "pydantic", "pyvista", "scipy", "threadpoolctl", "trimesh"},
     "twin": {"assets", "estimation", "fem", "scenes"}
     | {"drjit", "matplotlib", "mitsuba", "mpl_toolkits", "numpy", "OpenEXR", "PIL", "pydantic"}
     | {"pydantic_core", "pyvista", "rich", "scipy", "skfem", "torch", "trimesh"},
