@@ -21,7 +21,7 @@ def curved_cube(cells: int) -> MeshHex2:
 
 
 def dirichlet(mesh: MeshHex2, modulus: float, poisson: float, exact: Floats, load: Floats) -> Floats:
-    """Solve with `exact` (3, nodes) prescribed on the cube's faces and nodal `load` (3 nodes,); gives (3, nodes)."""
+    """Solve with `exact` (3, nodes) prescribed on the faces and nodal `load` (3 nodes,); gives (3, nodes)."""
     n = mesh.t.shape[1]
     matrices = elasticity.stiffness(mesh, np.full(n, modulus), np.full(n, poisson))
     local = elasticity.element_dofs(mesh)
@@ -39,7 +39,7 @@ def dirichlet(mesh: MeshHex2, modulus: float, poisson: float, exact: Floats, loa
 
 @pytest.mark.parametrize("poisson", [0.0, 0.3, 0.4999])
 def test_patch(poisson: float) -> None:
-    """A linear displacement is reproduced to rounding on curved elements (for incompressible matter: volume kept)."""
+    """A linear displacement is reproduced to rounding on curved elements."""
     mesh = curved_cube(3)
     gradient = np.array([[0.3, 0.1, -0.2], [0.05, -0.1, 0.4], [0.2, 0.15, -0.2]])
     exact = gradient @ mesh.doflocs
