@@ -16,7 +16,7 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from skfem import MeshHex, MeshHex2
+from skfem import ElementHex2, MeshHex, MeshHex2
 
 from fem.model import Inclusion, Probe, Slab
 
@@ -238,10 +238,8 @@ def morph_probe(res: Resolution, box: Box, probe: Probe, slab: Slab) -> MeshHex2
 
 def _checked(mesh: MeshHex2, name: str) -> MeshHex2:
     """Refuse a mesh with an element whose Jacobian is not positive at every node of its Q2 lattice."""
-    lattice = MeshHex2().doflocs
-    det = -mesh.mapping().detDF(
-        lattice
-    )  # scikit-fem's reference hexahedron is point-mirrored: upright ones have -1
+    # scikit-fem's reference hexahedron is point-mirrored: upright ones have a negative determinant
+    det = -mesh.mapping().detDF(ElementHex2.doflocs.T)
     if det.min() <= 0:
         cell = int(det.min(axis=1).argmin())
         x, y, z = mesh.p[:, mesh.t[:, cell]].mean(axis=1)
