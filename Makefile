@@ -40,7 +40,7 @@ setup: $(READY)
 # torch goes first and alone: with its exact version given, pip takes the build that is there.
 $(READY): pyproject.toml constraints.txt | $(BIN)/pip
 	$(BIN)/python -m pip install -q -c constraints.txt $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) torch==2.13.0
-	$(BIN)/python -m pip install -q -c constraints.txt -e ".[test]"
+	PYTHONWARNINGS=ignore $(BIN)/python -m pip install -q -c constraints.txt -e ".[test]"
 	$(BIN)/python -m scenes.llvm_fetch .llvm
 	@touch $@
 

@@ -6,9 +6,9 @@ summation of pixel values" and "the number of pixel greater than the specific th
 - **area** counts the pixels strictly above k;
 - the **centroid** is that of those pixels, each weighted with its counts, so that neither a tilted
   background below k nor the number of dark pixels around pulls it;
-- **maximum** is the mean of the 3 x 3 pixels around the pixel that holds the centroid: one noisy pixel cannot
-  decide it. At the picture's border the window keeps to the pixels that exist. Where no pixel is above k there
-  is no centroid, and the maximum is 0, as the area is;
+- **maximum** is the mean of the 3 x 3 pixels around the pixel that holds the centroid: one noisy pixel
+  cannot decide it. At the picture's border the window keeps to the pixels that exist. Where no pixel is
+  above k there is no centroid, and the maximum is 0, as the area is;
 - **total** sums the whole picture, signs included, so that noise averages out instead of adding up.
 """
 

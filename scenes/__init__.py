@@ -1,13 +1,19 @@
 """Optics: from a pressed contact surface to the radiance at the camera.
 
-`gap_transmittance` is the law, `Renderer` the transport of light, `expose` the camera. Mitsuba is imported with the first
-`Renderer`, not here, so that reading a design or asking for help stays fast.
+`gap_transmittance` is the law, `Renderer` the transport of light, `expose` the camera. What draws in VTK or Mitsuba is imported
+with the first `Renderer`, not here, so that reading a design or asking for help stays fast.
 """
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
 
 from .camera import expose, mean_counts, tare
 from .ftir import gap_transmittance
-from .render import Renderer, Rendering
 from .sensor import Camera, Glass, Guide, Led, Sensor, Skin, Tissue
+
+if TYPE_CHECKING:
+    from .render import Renderer, Rendering
 
 __all__ = [
     "Camera",
@@ -24,3 +30,11 @@ __all__ = [
     "mean_counts",
     "tare",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name in ("Renderer", "Rendering"):
+        from . import render
+
+        return getattr(render, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -48,16 +48,18 @@ def use(device: str = "auto") -> str:
                 "start a new process to change it"
             )
         return active
+    # First of all, and for the GPU too: the first variant that is tried, even in vain, settles the LLVM.
+    library = llvm.find()
+    if not library.fault:
+        os.environ["DRJIT_LIBLLVM_PATH"] = str(library.path)
     if device != "cpu":
         fault = _cuda_fault() or _activate("cuda")
         if not fault:
             return VARIANTS["cuda"]
         if device == "cuda":
             raise BackendError(f"device: received 'cuda', but {fault}; allowed here: 'auto', 'cpu'")
-    library = llvm.find()
     if library.fault:
         raise BackendError(f"device: no usable LLVM for Mitsuba on the CPU ({library.fault}); {llvm.ADVICE}")
-    os.environ["DRJIT_LIBLLVM_PATH"] = str(library.path)
     fault = _activate("cpu")
     if fault:
         raise BackendError(f"device: Mitsuba does not start on the CPU ({fault}); {llvm.ADVICE}")
@@ -83,7 +85,7 @@ def _activate(device: str) -> str:
 
         mitsuba.set_variant(VARIANTS[device])
     except (ImportError, RuntimeError) as error:
-        return str(error).strip().splitlines()[0]
+        return str(error).strip().splitlines()[0].rstrip(".")
     return ""
 
 

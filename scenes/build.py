@@ -56,7 +56,7 @@ def load_scene(sensor: Sensor, optics: ContactOptics) -> mi.Scene:
         scene[f"rim_{side}"] = _wall(half, lowest, bottom, outward, _BLACK)
     for number, led in enumerate(sensor.leds):
         scene[f"led_{number}"] = _led(led, half)
-    return mi.load_dict(scene)
+    return mi.load_dict(scene, optimize=False)  # merging would lose the walls' names
 
 
 def put_surface(scene: mi.Scene, sensor: Sensor, deformed: surface.OpticalSurface) -> None:
@@ -74,7 +74,7 @@ def light_only(scene: mi.Scene, sensor: Sensor, number: int | None) -> None:
     parameters = mi.traverse(scene)
     for other, led in enumerate(sensor.leds):
         on = number is None or other == number
-        parameters[f"led_{other}.emitter.radiance.value"] = _radiance(led) if on else 0.0
+        parameters[f"led_{other}.emitter.radiance.value"] = radiance(led) if on else 0.0
     parameters.update()
 
 
@@ -145,10 +145,10 @@ def _led(led: Led, half: float) -> dict[str, Any]:
         "type": "disk",
         "to_world": place.scale(led.diameter_mm / 2),
         "bsdf": _BLACK,
-        "emitter": {"type": "area", "radiance": {"type": "uniform", "value": _radiance(led)}},
+        "emitter": {"type": "area", "radiance": {"type": "uniform", "value": radiance(led)}},
     }
 
 
-def _radiance(led: Led) -> float:
-    """Radiance of a Lambertian disc, W / (mm² sr)."""
+def radiance(led: Led) -> float:
+    """Radiance of an LED's Lambertian disc, W / (mm² sr)."""
     return float(led.flux_W / (dr.pi * (dr.pi * led.diameter_mm**2 / 4)))

@@ -7,10 +7,11 @@ know that nobody touched a pixel keeps the file's SHA-256.
 
 from __future__ import annotations
 
+import contextlib
 import io
 import os
+import secrets
 import struct
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -128,28 +129,20 @@ def read_png(path: StrPath) -> NDArray[Any]:
 def write_bytes(path: StrPath, data: bytes) -> None:
     """Put bytes under a name all at once: readers see the old file or the new one, never a part."""
     path = Path(path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.part")
     try:
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
-    except OSError as error:
-        raise ImageError(f"{path}: cannot be written ({error.strerror})") from error
-    try:
-        with os.fdopen(handle, "wb") as file:
+        # Not tempfile: it makes files that only their owner may read.
+        with open(temporary, "xb") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
-        os.chmod(temporary, 0o666 & ~_umask())  # mkstemp makes it private; give what open() would have given
         os.replace(temporary, path)
     except BaseException as error:
-        Path(temporary).unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink()
         if isinstance(error, OSError):
             raise ImageError(f"{path}: cannot be written ({error.strerror})") from error
         raise
-
-
-def _umask() -> int:
-    mask = os.umask(0o077)  # there is no call that only asks
-    os.umask(mask)
-    return mask
 
 
 def _read(path: Path) -> bytes:

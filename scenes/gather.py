@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .bsdf import Table
+from .build import radiance
 from .sensor import Sensor
 from .trace import AngularBasis
 from .view import PixelRays, faces_reflectance
@@ -31,10 +32,13 @@ class Sight:
     points : list of (x, y, fraction, gain)
         For each sight, on the device: position in units of the guide's width (0..1), real contact fraction, and radiance at
         the camera per transmitted irradiance, 1/sr.
+    lamps : (n_led, rows, columns)
+        Radiance at the camera, W mm⁻² sr⁻¹, of LEDs that stand in the way (embedded ones).
     """
 
     position_mm: NDArray[np.float32]
     points: list[tuple[mi.Float, mi.Float, mi.Float, mi.Float]]
+    lamps: NDArray[np.float32]
 
 
 def look(scene: mi.Scene, sensor: Sensor, table: Table, rays: PixelRays) -> Sight:
@@ -48,6 +52,7 @@ def look(scene: mi.Scene, sensor: Sensor, table: Table, rays: PixelRays) -> Sigh
     contact = next(shape for shape in scene.shapes() if shape.id() == "contact")
 
     points = []
+    lamps = _lamps(scene, sensor, mi.Point3f(*origin), direction, gain).reshape(len(sensor.leds), *shape)
     start = mi.Point3f(origin[0], origin[1], origin[2] + 1e-3)
     for _ in range(_SIGHTS):
         si = scene.ray_intersect(mi.Ray3f(start, direction))
@@ -64,7 +69,21 @@ def look(scene: mi.Scene, sensor: Sensor, table: Table, rays: PixelRays) -> Sigh
     dr.eval(points)
     x, y = (np.asarray(points[0][i]).reshape(shape) for i in (0, 1))
     position = (np.stack([x, y], axis=-1) - 0.5) * guide.width_mm
-    return Sight(position.astype(np.float32), points)
+    return Sight(position.astype(np.float32), points, lamps)
+
+
+def _lamps(
+    scene: mi.Scene, sensor: Sensor, origin: mi.Point3f, direction: mi.Vector3f, gain: mi.Float
+) -> NDArray[np.float32]:
+    """Radiance at the camera of LEDs that the pixels' rays meet from the front."""
+    named = {shape.id(): mi.ShapePtr(shape) for shape in scene.shapes()}
+    si = scene.ray_intersect(mi.Ray3f(origin, direction))
+    front = si.is_valid() & (mi.Frame3f.cos_theta(si.wi) > 0.0)
+    layers = []
+    for number, led in enumerate(sensor.leds):
+        meets = front & (si.shape == named[f"led_{number}"])
+        layers.append(np.asarray(dr.select(meets, gain * radiance(led), 0.0)))
+    return np.stack(layers)
 
 
 def picture(sight: Sight, basis: AngularBasis, irradiance: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -89,4 +108,5 @@ def picture(sight: Sight, basis: AngularBasis, irradiance: NDArray[np.float64]) 
                 total[led] += weight * landed[led * count + k]
     dr.eval(total)
     shape = (n_led, *sight.position_mm.shape[:2])
-    return np.stack([np.asarray(layer) for layer in total]).reshape(shape).astype(np.float32) * np.float32(1e6)
+    layers = np.stack([np.asarray(layer) for layer in total]).reshape(shape)
+    return np.asarray((layers + sight.lamps) * np.float32(1e6))

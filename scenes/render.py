@@ -111,19 +111,20 @@ class Renderer:
         if quality == "reference":
             radiance, noise = self._reference(samples or REFERENCE_SAMPLES, seed, tell)
         else:
-            radiance, noise = self._traced(sight, samples or PATHS_PER_LED[quality], seed, tell)
+            radiance, noise = self._traced(shape, sight, samples or PATHS_PER_LED[quality], seed, tell)
         pressure, displacement_z = surface.at(shape, sight.position_mm)
         return Rendering(radiance, sight.position_mm, pressure, displacement_z, noise, time.perf_counter() - start)
 
     def _traced(
-        self, sight: Sight, samples: int, seed: int, tell: Callable[[float], None]
+        self, shape: surface.OpticalSurface, sight: Sight, samples: int, seed: int, tell: Callable[[float], None]
     ) -> tuple[NDArray[np.float32], float]:
-        from . import gather, trace
+        from . import direct, gather, trace
 
+        straight = direct.direct(self.sensor, self.basis, shape)
         halves = []
         for half in (0, 1):
             landed = trace.trace(self.scene, self.sensor, self.basis, max(samples // 2, 1), 2 * seed + half)
-            halves.append(gather.picture(sight, self.basis, trace.smooth(landed)))
+            halves.append(gather.picture(sight, self.basis, straight + trace.smooth(landed)))
             tell(0.5 * (half + 1))
         radiance = 0.5 * (halves[0] + halves[1])
         both = [layers.sum(axis=0, dtype=np.float64) for layers in halves]

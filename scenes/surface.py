@@ -127,3 +127,9 @@ def at(surface: OpticalSurface, position_mm: NDArray[np.float32]) -> tuple[NDArr
         undeformed = target - shift
     pressure = look_up(surface.pressure_kPa, undeformed)
     return pressure.astype(np.float32), look_up(surface.displacement_mm[..., 2], undeformed).astype(np.float32)
+
+
+def heights(surface: OpticalSurface, line_mm: Array) -> Array:
+    """Height z, mm, of the deformed surface over the grid of deformed coordinates `line_mm` (m,), shape (m, m) at [iy, ix]."""
+    x, y = np.meshgrid(line_mm, line_mm)
+    return at(surface, np.stack([x, y], axis=-1).astype(np.float32))[1].astype(np.float64)

@@ -1,5 +1,8 @@
 """Light traced from the LEDs: how much of it, and at what angles, arrives where on the contact surface.
 
+Two families of paths are left out because `direct` gathers them without noise: straight from the LED to the surface, and mirrored
+once in the glass's lower face.
+
 Import only after a variant is set (`scenes.backend.use`).
 """
 
@@ -22,9 +25,11 @@ from .sensor import Sensor
 Array = NDArray[np.float64]
 
 CELLS = 100  # of the irradiance grid, per side
-_SMOOTHING_CELLS = 1.4  # standard deviation of the smoothing kernel
+_SMOOTHING_CELLS = 2.5  # standard deviation of the smoothing kernel
 _FIXED_POINT = float(2**20)  # deposits are summed as integers: the sum does not depend on the order of threads
 _MAX_BOUNCES = 256
+# Legs of the two families of paths that `direct` gathers, and any other
+_IN_AIR, _IN_GUIDE, _DOWN, _IN_GLASS_UP, _BACK_UP, _OTHER = range(6)
 _SURE_BOUNCES = 12  # before Russian roulette
 # Fractional parts of powers of 1/phi_4, phi_4 the root of x^5 = x + 1, times 2^32: an additive recurrence that fills the
 # unit 4-cube evenly (Roberts 2018; key roberts2018)
@@ -83,29 +88,30 @@ def trace(scene: mi.Scene, sensor: Sensor, basis: AngularBasis, samples: int, se
     random = mi.PCG32(size=n_led * samples, initstate=dr.opaque(mi.UInt64, seed), initseq=mi.UInt64(index) + 1)
     weights = mi.Float(np.ascontiguousarray(basis.columns.T, dtype=np.float32).ravel())
     landed = dr.zeros(mi.Int64, n_led * count * CELLS * CELLS)
-    contact = mi.ShapePtr(next(shape for shape in scene.shapes() if shape.id() == "contact"))
+    named = {shape.id(): mi.ShapePtr(shape) for shape in scene.shapes()}
+    contact, upper, lower = named["contact"], named["guide_to_glass"], named["glass_to_air"]
+    walls = [pointer for name, pointer in named.items() if name.startswith("wall_")]
     context = mi.BSDFContext(mi.TransportMode.Importance)
     n_cos = basis.columns.shape[1]
 
     throughput, bounce, alive = mi.Float(1.0), mi.UInt32(0), mi.Bool(True)
+    in_air = mi.Bool(np.array([led.coupling == "air" for led in sensor.leds]))
+    leg = dr.select(dr.gather(mi.Bool, in_air, number), mi.UInt32(_IN_AIR), mi.UInt32(_IN_GUIDE))
 
-    def going(ray, throughput, bounce, alive, random):  # type: ignore[no-untyped-def]
+    def going(ray, throughput, bounce, leg, alive, random):  # type: ignore[no-untyped-def]
         return alive
 
-    def step(ray, throughput, bounce, alive, random):  # type: ignore[no-untyped-def]
+    def step(ray, throughput, bounce, leg, alive, random):  # type: ignore[no-untyped-def]
         si = scene.ray_intersect(ray, alive)
         alive &= si.is_valid()
         cosine = mi.Frame3f.cos_theta(si.wi)
-        lands = alive & (si.shape == contact) & (cosine > 0.0)
+        on_contact = si.shape == contact
+        gathered = (leg == _IN_GUIDE) | (leg == _BACK_UP)  # `direct` counts these
+        lands = alive & on_contact & (cosine > 0.0) & ~gathered
         column = mi.UInt32(dr.clip((si.p.x / width + 0.5) * CELLS, 0.0, CELLS - 1.0))
         row = mi.UInt32(dr.clip((si.p.y / width + 0.5) * CELLS, 0.0, CELLS - 1.0))
-        at = dr.clip(cosine, 0.0, 1.0) * (n_cos - 1)
-        node = dr.minimum(mi.UInt32(at), n_cos - 2)
-        share = at - mi.Float(node)
-        for k in range(count):
-            low = dr.gather(mi.Float, weights, node * count + k, lands)
-            high = dr.gather(mi.Float, weights, (node + 1) * count + k, lands)
-            amount = mi.Int64(dr.round(throughput * dr.lerp(low, high, share) * _FIXED_POINT))
+        for k, weight in enumerate(weigh(weights, count, n_cos, cosine, lands)):
+            amount = mi.Int64(dr.round(throughput * weight * _FIXED_POINT))
             cell = ((number * count + k) * CELLS + row) * CELLS + column
             dr.scatter_add(landed, amount, cell, lands)
 
@@ -113,40 +119,70 @@ def trace(scene: mi.Scene, sensor: Sensor, basis: AngularBasis, samples: int, se
         sample2 = mi.Point2f(random.next_float32(), random.next_float32())
         scattered, weight = si.bsdf(ray).sample(context, si, sample1, sample2, alive)
         throughput = throughput * dr.select(alive, weight[0], 0.0)
+        passed = mi.has_flag(scattered.sampled_type, mi.BSDFFlags.DeltaTransmission)
+        on_wall = mi.Bool(False)
+        for wall in walls:
+            on_wall |= si.shape == wall
+        enters = (leg == _IN_AIR) & on_wall & passed
+        goes_down = (leg == _IN_GUIDE) & (si.shape == upper) & passed
+        turns = (leg == _DOWN) & (si.shape == lower) & ~passed
+        comes_up = (leg == _IN_GLASS_UP) & (si.shape == upper) & passed
+        leg = dr.select(enters, _IN_GUIDE, dr.select(goes_down, _DOWN, dr.select(turns, _IN_GLASS_UP,
+              dr.select(comes_up, _BACK_UP, mi.UInt32(_OTHER)))))
         survive = dr.select(bounce < _SURE_BOUNCES, 1.0, dr.minimum(throughput, 0.95))
         alive &= (throughput > 0.0) & (random.next_float32() < survive) & (bounce < _MAX_BOUNCES)
         throughput = dr.select(alive, throughput / survive, 0.0)
         ray = si.spawn_ray(si.to_world(scattered.wo))
-        return ray, throughput, bounce + 1, alive, random
+        return ray, throughput, bounce + 1, leg, alive, random
 
-    dr.while_loop((ray, throughput, bounce, alive, random), going, step, labels=("ray", "w", "n", "on", "rng"))
+    dr.while_loop((ray, throughput, bounce, leg, alive, random), going, step)
     sums = landed.numpy().reshape(n_led, count, CELLS, CELLS).astype(np.float64) / _FIXED_POINT
     flux = np.array([led.flux_W for led in sensor.leds])
     return np.asarray(sums * (flux / samples / (width / CELLS) ** 2)[:, None, None, None])
 
 
-def smooth(irradiance: Array, refine: int = 4) -> Array:
-    """Smoothed irradiance on a grid `refine` times finer, over the last two axes, mirrored at the edges.
+def smooth(irradiance: Array, factor: int = 4) -> Array:
+    """Smoothed irradiance on a grid `factor` times finer, over the last two axes, mirrored at the edges.
 
     The kernel 2 G - G * G has no second moment, so the curvature of the irradiance survives; cubic splines interpolate.
     """
-    step = _smoothing_matrix(irradiance.shape[-1], refine)
+    return _along_both(_smoothing_matrix(irradiance.shape[-1], factor, smoothed=True), irradiance)
+
+
+def refine(irradiance: Array, factor: int) -> Array:
+    """Values on a grid `factor` times finer over the last two axes, by cubic splines between the cells' middles."""
+    return _along_both(_smoothing_matrix(irradiance.shape[-1], factor, smoothed=False), irradiance)
+
+
+def weigh(
+    weights: mi.Float, count: int, n_cos: int, cosine: mi.Float, active: mi.Bool
+) -> list[mi.Float]:
+    """The basis' columns at a cosine; `weights` is their (n_cos, count) table, flattened."""
+    at = dr.clip(cosine, 0.0, 1.0) * (n_cos - 1)
+    node = dr.minimum(mi.UInt32(at), n_cos - 2)
+    share = at - mi.Float(node)
+    low = [dr.gather(mi.Float, weights, node * count + k, active) for k in range(count)]
+    high = [dr.gather(mi.Float, weights, (node + 1) * count + k, active) for k in range(count)]
+    return [dr.lerp(a, b, share) for a, b in zip(low, high, strict=True)]
+
+
+def _along_both(step: Array, irradiance: Array) -> Array:
     # einsum, not matmul: its order of summation does not depend on the number of threads
     return np.einsum("yi,...ij,xj->...yx", step, irradiance, step, optimize=["einsum_path", (0, 1), (0, 1)])
 
 
 @lru_cache(maxsize=4)
-def _smoothing_matrix(cells: int, refine: int) -> Array:
-    """(refine * cells, cells): smooth along one axis, then interpolate at the finer cells' middles."""
+def _smoothing_matrix(cells: int, factor: int, *, smoothed: bool) -> Array:
+    """(factor * cells, cells): smooth along one axis if asked to, then interpolate at the finer cells' middles."""
     reach = int(np.ceil(6 * _SMOOTHING_CELLS))
     gauss = np.exp(-0.5 * (np.arange(-reach, reach + 1) / _SMOOTHING_CELLS) ** 2)
     gauss /= gauss.sum()
     twice = np.convolve(gauss, gauss)
     kernel = -twice
     kernel[reach:-reach] += 2.0 * gauss
-    smoothed = correlate1d(np.eye(cells), kernel, axis=0, mode="reflect")
-    middles, finer = np.arange(cells) + 0.5, (np.arange(refine * cells) + 0.5) / refine
-    return np.asarray(CubicSpline(middles, smoothed)(finer))
+    cell_values = correlate1d(np.eye(cells), kernel, axis=0, mode="reflect") if smoothed else np.eye(cells)
+    middles, finer = np.arange(cells) + 0.5, (np.arange(factor * cells) + 0.5) / factor
+    return np.asarray(CubicSpline(middles, cell_values)(finer))
 
 
 def _emit(sensor: Sensor, number: mi.UInt32, index: mi.UInt32, seed: int) -> mi.Ray3f:

@@ -35,8 +35,10 @@ REAL = sorted({path.resolve() for path in Path("/usr/lib").glob("*-linux-gnu/lib
 BAD = [*STUBS, *REAL]
 
 
-def run(device: str, folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run PROGRAM where only the libraries of `folder` can be found."""
+def run(
+    device: str, folder: Path, program: str = PROGRAM, **environment: str
+) -> subprocess.CompletedProcess[str]:
+    """Run a program where only the libraries of `folder` can be found."""
     clean = {key: value for key, value in os.environ.items() if key != "DRJIT_LIBLLVM_PATH"}
     surroundings = {
         "TWIN_LLVM_DIRS": str(folder),
@@ -45,7 +47,7 @@ def run(device: str, folder: Path, **environment: str) -> subprocess.CompletedPr
         "PYTHONPATH": str(ROOT),
     }
     return subprocess.run(
-        [sys.executable, "-c", PROGRAM, device],
+        [sys.executable, "-c", program, device],
         env=clean | surroundings | environment,
         cwd=folder,
         capture_output=True,
@@ -72,8 +74,11 @@ def good() -> Path:
     return found.path
 
 
-@pytest.mark.parametrize("named", [False, True], ids=["found", "named"])
-@pytest.mark.parametrize("bad", BAD, ids=lambda bad: bad if isinstance(bad, str) else f"real {bad.name}")
+@pytest.mark.parametrize(
+    ("bad", "named"),
+    [*((bad, False) for bad in BAD), ("libLLVM-15.so.1", True), *((bad, True) for bad in REAL[-1:])],
+    ids=lambda value: {False: "found", True: "named"}.get(value) or getattr(value, "name", value),
+)
 def test_bad_llvm_alone_is_refused_in_one_line(bad: str | Path, named: bool, tmp_path: Path) -> None:
     library = place(bad, tmp_path)
     done = run("cpu", tmp_path, **({"DRJIT_LIBLLVM_PATH": str(library)} if named else {}))
@@ -161,6 +166,17 @@ def test_cuda_gpu_is_used_unless_the_cpu_is_asked_for(good: Path) -> None:
     assert run("cpu", good.parent).stdout.startswith("llvm_ad_mono")
 
 
+def test_gpu_that_fails_leaves_the_cpu_usable(good: Path, tmp_path: Path) -> None:
+    """Trying a CUDA variant starts Dr.Jit's LLVM as well: it has to be the good one by then."""
+    for one in STUBS:
+        place(one, tmp_path)
+    (tmp_path / good.name).symlink_to(good)
+    pretend = "from scenes import backend\nbackend._cuda_fault = lambda: ''\n"
+    done = run("auto", tmp_path, program=pretend + PROGRAM)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split()[0] in backend.VARIANTS.values() and done.stdout.split()[1] == "126.0"
+
+
 def test_choice_is_made_once(variant: str) -> None:
     assert backend.use() == backend.use("cpu") == variant == "llvm_ad_mono"
     with pytest.raises(backend.BackendError, match="already runs Mitsuba's llvm_ad_mono"):
@@ -186,3 +202,22 @@ def test_fetch_without_apt_says_what_to_install(tmp_path: Path, monkeypatch: pyt
         llvm_fetch.provide(tmp_path / "llvm")
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "llvm").exists()
+
+
+def test_command_line_refuses_a_bad_llvm(tmp_path: Path) -> None:
+    """What a user sees: exit status 2, one line with what to install, and no half-made folder."""
+    place("libLLVM-15.so.1", tmp_path)
+    words = ["simulate", "tsis", "--size", "10", "--depth", "5", "--modulus", "100", "--device", "cpu"]
+    done = subprocess.run(
+        [sys.executable, "-m", "twin", *words, "--out", str(tmp_path / "out")],
+        env={key: value for key, value in os.environ.items() if key != "DRJIT_LIBLLVM_PATH"}
+        | {"TWIN_LLVM_DIRS": str(tmp_path)},
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 2, done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1, done.stderr
+    assert "libllvm19" in done.stderr and "libLLVM-15.so.1 would abort the process" in done.stderr
+    assert not (tmp_path / "out").exists()

@@ -188,3 +188,9 @@ def test_files_get_ordinary_rights(tmp_path):
     write_png(tmp_path / "a.png", np.zeros((3, 4), np.uint8))
     (tmp_path / "plain").write_bytes(b"")
     assert (tmp_path / "a.png").stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
+def test_writing_below_a_file_is_one_line(tmp_path):
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(ImageError, match="cannot be written"):
+        write_png(tmp_path / "file" / "a.png", np.zeros((3, 4), np.uint8))

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import reprlib
 from collections.abc import Iterator, Mapping, Sequence
+from datetime import date, time
 from typing import Any
 
 from pydantic import ValidationError
@@ -55,7 +56,7 @@ class DesignError(ValueError):
 
 def shown(value: object) -> str:
     """Return a value as a person would have written it, shortened to fit a line."""
-    return _shorten.repr(value)
+    return str(value) if isinstance(value, date | time) else _shorten.repr(value)
 
 
 def from_validation(error: ValidationError, data: object, schema: Mapping[str, Any]) -> DesignError:

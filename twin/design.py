@@ -115,12 +115,10 @@ class Design:
     camera: Annotated[Camera, Field(description="The camera below the glass.")]
     specimen: Annotated[Specimen, Field(description="The tissue slab, without its inclusion.")]
     description: Annotated[str, Field(max_length=1000, description="One line for people.")] = ""
-    light: Annotated[Light, Field(description="The light of the LEDs.")] = Light()
+    light: Annotated[Light, Field(description="What light the LEDs give.")] = Light()
     glass: Annotated[Glass, Field(description="The rigid plate between waveguide and camera.")] = Glass()
     surface: Annotated[Skin, Field(description="The rough contact between waveguide and tissue.")] = Skin()
-    press: Annotated[
-        PressDepths, Field(description="How the sensor is pressed where nothing else is said.")
-    ] = PressDepths()
+    press: Annotated[PressDepths, Field(description="The press, where nothing else is said.")] = PressDepths()
     signal: Annotated[Signal, Field(description="The thresholds k of the scalars.")] = Signal()
 
     def __post_init__(self) -> None:
@@ -266,9 +264,10 @@ def parse_design(data: dict[str, Any], source: str = "") -> Design:
         first = found[0]
         raise DesignError(first.field, first.received, first.allowed, source=source, more=len(found) - 1)
     try:
-        # As JSON, because only there does pydantic's strict mode take a table for a dataclass and a list
-        # for a tuple while it still refuses "25" or true where a number belongs.
-        return _ADAPTER.validate_json(json.dumps(data, default=str), strict=True)
+        # As JSON, because only there does pydantic's strict mode take a table for a dataclass and a list for
+        # a tuple while it still refuses "25" or true where a number belongs. JSON has no dates, and neither
+        # has a design: null is refused in their place.
+        return _ADAPTER.validate_json(json.dumps(data, default=lambda date: None), strict=True)
     except ValidationError as error:
         raise from_validation(error, data, schema).renamed(source=source) from None
 

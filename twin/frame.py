@@ -160,7 +160,7 @@ def _write(frame: Frame, folder: Path) -> None:
     overview(frame, folder / "overview.png")
     record = frame.record()
     record["sha256"] = {path.name: _sha256(path) for path in sorted(folder.iterdir())}
-    text = json.dumps(record, indent=2, allow_nan=False, ensure_ascii=False)
+    text = json.dumps(record, indent=2, allow_nan=False, ensure_ascii=False, default=np.generic.item)
     (folder / RECORD).write_text(text + "\n", encoding="utf-8")
 
 

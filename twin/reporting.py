@@ -8,6 +8,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+from rich import box
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
@@ -58,35 +59,36 @@ class Reporter:
 
 def summarise(frames: Sequence[Frame], out: Path) -> None:
     """Print the scalars of each frame, raw and tared, and where the files are."""
-    table = Table(title=_title(frames[0]), title_justify="left", caption_justify="left")
-    table.caption = (
-        "tared: minus the same press without inclusion; max of the surface in µm, total in mm³, area in mm²"
+    table = Table(title=_title(frames[0]), title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table.add_column("press", justify="right", no_wrap=True)
+    surface_and_picture = (
+        "max\nµm",
+        "total\nmm³",
+        "area\nmm²",
+        "max\ncounts",
+        "total\ncounts",
+        "area\npixels",
     )
-    table.add_column("press")
-    for heading in ("surface max", "total", "area", "picture max", "total", "area"):
-        table.add_column(heading, justify="right")
+    for place, quantity in zip(3 * ("surface",) + 3 * ("picture",), surface_and_picture, strict=True):
+        table.add_column(f"{place}\n{quantity}", justify="right", no_wrap=True)
     for frame in frames:
         press = f"{frame.press['indentation_mm']:.3g} mm, {frame.press['force_N']:.3g} N"
         for kind in ("raw", "tared"):
             surface, picture = frame.fem[kind], frame.tsis[kind]
             table.add_row(
-                f"{press} {kind}",
-                f"{1e3 * surface['max_mm']:.2f} µm",
+                f"{press} {kind}" if kind == "raw" else kind,
+                f"{1e3 * surface['max_mm']:.2f}",
                 f"{surface['total_mm3']:.3f}",
                 f"{surface['area_mm2']:.1f}",
-                f"{picture['max_dn']:.1f} counts",
+                f"{picture['max_dn']:.1f}",
                 f"{picture['total_dn']:.0f}",
-                f"{picture['area_px']} px",
+                f"{picture['area_px']}",
             )
-            press = ""
     console = Console(highlight=False)
     console.print(table)
-    pages = (
-        [out / "overview.png"]
-        if len(frames) == 1
-        else [out / f"{n:02d}" / "overview.png" for n in range(len(frames))]
-    )
-    console.print("look at: " + ", ".join(str(page) for page in pages), soft_wrap=True)
+    console.print("tared: minus the same press without inclusion", soft_wrap=True)
+    folders = [out] if len(frames) == 1 else [out / f"{number:02d}" for number in range(len(frames))]
+    console.print("look at: " + ", ".join(str(folder / "overview.png") for folder in folders), soft_wrap=True)
     console.print(f"all files: {out}", soft_wrap=True)
 
 

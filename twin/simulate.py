@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypedDict, Unpack, overload
+from typing import TYPE_CHECKING, Literal, TypedDict, Unpack, overload
 
 import numpy as np
 
 import fem
 from estimation import scalars
+from fem.model import check as check_mechanics
 from twin.complaint import DesignError, shown
 from twin.design import Design, load_design
 from twin.frame import Frame
 
 if TYPE_CHECKING:
-    import pyvista
-
     from fem import Press
     from scenes import Renderer, Rendering
 
@@ -33,8 +32,21 @@ REFERENCE_FRAMES = 16
 # Purposes of random numbers: children of the seed, so that one more draw for one leaves the others alone.
 _LIGHT, _PICTURE, _REFERENCE = range(3)
 
-# Seconds that mechanics and one rendering take on two cores: they only shape the estimate of the time left.
-_MECHANICS_COST, _LIGHT_COST = 6.0, 8.0
+
+@dataclass(frozen=True)
+class _Work:
+    """How much is done: mechanics once, then light for each level."""
+
+    progress: Progress
+    levels: int
+    # Seconds that mechanics and one level's light take on two cores; only to estimate the time left.
+    mechanics: float = 6.0
+    light: float = 8.0
+
+    def tell(self, stage: str, mechanics: float, levels: float = 0.0) -> None:
+        """Pass on which stage runs now, with the share of the mechanics and the number of levels done."""
+        done = self.mechanics * mechanics + self.light * levels
+        self.progress(stage, done / (self.mechanics + self.light * self.levels))
 
 
 class Options(TypedDict, total=False):
@@ -103,23 +115,30 @@ def simulate(
     check(design, inclusion, levels, by_force=by_force)
     if not isinstance(seed, int) or isinstance(seed, bool) or seed < 0:
         raise DesignError("seed", shown(seed), "an integer >= 0")
-    tell = progress or (lambda stage, done: None)
-
     from scenes import Renderer
 
     renderer = Renderer(design.sensor(), device=device)
-    # Linear mechanics: one solve at a unit load serves every level, whose bytes then do not depend on the others.
-    total = _MECHANICS_COST + _LIGHT_COST * len(levels)
-    tell("mechanics", 0.0)
-    load: dict[str, Any] = {"force": 1.0} if by_force else {"indentation": 1.0}
-    unit = fem.press(design.probe(), design.slab(), inclusion, quality=quality, **load)
-    if by_force:
-        _check_forces(design, unit, levels)
+    work = _Work(progress or (lambda stage, done: None), len(levels))
     frames = []
     for number, level in enumerate(levels):
-        tell(f"light {number + 1} of {len(levels)}", (_MECHANICS_COST + number * _LIGHT_COST) / total)
-        frames.append(_frame(design, inclusion, scaled(unit, level), renderer, quality, seed, level))
-    tell("done", 1.0)
+        # The mechanics are linear and `fem.press` keeps its last solution: further levels only scale it.
+        press = fem.press(
+            design.probe(),
+            design.slab(),
+            inclusion,
+            **{"force" if by_force else "indentation": level},
+            quality=quality,
+            progress=lambda stage, share: work.tell("mechanics", share),
+        )
+        if by_force:
+            _check_depth(design, press, levels)
+        stage = "light" if len(levels) == 1 else f"light {number + 1} of {len(levels)}"
+
+        def tell(share: float, stage: str = stage, number: int = number) -> None:
+            work.tell(stage, 1.0, number + share)
+
+        tell(0.0)
+        frames.append(_frame(design, inclusion, press, renderer, quality, seed, level, tell))
     return frames if several else frames[0]
 
 
@@ -133,32 +152,12 @@ def check(
     """Raise, before any work is done, if the press cannot be simulated: levels are mm, or N ``by_force``."""
     if inclusion is not None:
         design.check_inclusion(inclusion)
-    fem.check(design.probe(), design.slab(), inclusion)
+    check_mechanics(design.probe(), design.slab(), inclusion)
     for level in levels:
         if not by_force:
             design.check_indentation(level)
         elif not 0.0 < level < np.inf:
             raise DesignError("press.force_N", shown(level), "a finite number > 0")
-
-
-def scaled(press: Press, factor: float) -> Press:
-    """Return the press under ``factor`` times its load: small strain is linear, contact stays closed."""
-    names = {entry.name for entry in dataclasses.fields(press)}
-    loads = [name for name in names if name.endswith(("_mm", "_N", "_kPa"))]
-    return dataclasses.replace(
-        press,
-        surface=_scaled_fields(press.surface, factor),
-        cut=_scaled_fields(press.cut, factor),
-        **{name: factor * getattr(press, name) for name in loads},
-    )
-
-
-def _scaled_fields(mesh: pyvista.PolyData, factor: float) -> pyvista.PolyData:
-    copy = mesh.copy()
-    for name in copy.point_data:
-        if name.startswith(("displacement", "pressure")):
-            copy.point_data[name] = factor * np.asarray(mesh.point_data[name])
-    return copy
 
 
 def _levels(
@@ -181,10 +180,11 @@ def _levels(
     return levels, force is not None, several
 
 
-def _check_forces(design: Design, unit: Press, levels: Sequence[float]) -> None:
+def _check_depth(design: Design, press: Press, forces: Sequence[float]) -> None:
+    """Raise `DesignError` if one of the forces presses deeper than is allowed; depth goes with force."""
     deepest = design.max_indentation_mm
-    most = deepest / max(unit.indentation_mm, unit.indentation_0_mm)
-    for force in levels:
+    most = deepest * press.force_N / max(press.indentation_mm, press.indentation_0_mm)
+    for force in forces:
         if force > most:
             allowed = f"a number > 0 and <= {most:.4g} N, which presses {deepest:g} mm deep"
             raise DesignError("press.force_N", shown(force), allowed)
@@ -198,13 +198,21 @@ def _frame(
     quality: Quality,
     seed: int,
     level: float,
+    tell: Callable[[float], None],
 ) -> Frame:
     start = time.perf_counter()
     camera, wavelength, k = design.camera, design.light.wavelength_nm, design.signal.counts
-    light = int(_random(seed, _LIGHT).generate_state(1)[0])  # the same with and without: their noise cancels
+    # The same with and without the inclusion, so that their noise cancels; 26 bits leave room for the LEDs.
+    light = int(_random(seed, _LIGHT).generate_state(1)[0]) >> 6
 
-    def render(field: str) -> Rendering:
-        return renderer.render(press.surface, field=field, quality=quality, seed=light)
+    def render(field: str, before: float) -> Rendering:
+        return renderer.render(
+            press.surface,
+            field=field,
+            quality=quality,
+            seed=light,
+            progress=lambda share: tell(before + 0.5 * share),
+        )
 
     def expose(rendering: Rendering, purpose: int, frames: int) -> np.ndarray:
         from scenes.camera import expose
@@ -214,10 +222,11 @@ def _frame(
             camera, rendering.radiance.sum(axis=0, dtype=np.float64), wavelength, rng, frames=frames
         )
 
-    lit = render("pressure")
-    unlit = render("pressure_0") if inclusion is not None else lit
+    lit = render("pressure", 0.0)
+    unlit = render("pressure_0", 0.5) if inclusion is not None else lit
     image = expose(lit, _PICTURE, 1)
     reference = expose(unlit, _REFERENCE, REFERENCE_FRAMES).astype(np.float32)
+    tell(1.0)
     return Frame(
         design=design,
         inclusion=inclusion,

@@ -1,0 +1,225 @@
+"""LED light that reaches the contact surface straight, or mirrored once in the glass's lower face: gathered, not traced.
+
+These two families of paths carry most of the light and all of its sharp edges (the rims of escape and acceptance cones), so
+they are integrated without noise and without smoothing. All other paths are left to `trace`.
+
+Import only after a variant is set (`scenes.backend.use`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from .build import led_frame
+from .sensor import Sensor
+from .surface import OpticalSurface, heights
+from .trace import AngularBasis, refine, weigh
+
+Array = NDArray[np.float64]
+
+CELLS = 200  # of the grid of target points, per side
+DISC_POINTS = 96
+_NEWTON_STEPS = 7
+_GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
+
+
+@dataclass(frozen=True)
+class _Path:
+    """Unknown slopes (y, z) per unit of the LED's axis where a ray leaves the disc, and all that follows from them.
+
+    Snell's law keeps the tangential components p of (index x direction) through every flat face, so one ray is two numbers.
+    """
+
+    p_y: mi.Float
+    p_z: mi.Float
+    p_x: mi.Float  # along the LED's axis, inside the guide
+    entry_y: mi.Float  # from the disc's point to where the ray enters the guide
+    entry_z: mi.Float
+    error: mi.Vector2f  # landing point minus target: along the axis, along the side
+    derivative: tuple[mi.Float, mi.Float, mi.Float, mi.Float]  # of the landing point: x_y, x_z, y_y, y_z
+    etendue: mi.Float  # dp_y dp_z per area of horizontal target plane
+
+
+def direct(sensor: Sensor, basis: AngularBasis, deformed: OpticalSurface) -> Array:
+    """Weighted irradiance of the two families, (n_led, count, 2 CELLS, 2 CELLS), W/mm², as `trace.smooth` returns the rest.
+
+    From a Lambertian disc of flux F and area A in a medium of index m, the element dA sends F/(pi A m²) dA dp_y dp_z, so the
+    irradiance at a target is that times |d(p_y, p_z)/d(x, y)|, the ray's two unknowns being found by Newton's method. Height and
+    slope of the deformed surface at the target are kept; what the other LEDs' discs shade is left out.
+    """
+    n_led, count = len(sensor.leds), basis.count
+    half = sensor.guide.width_mm / 2
+    middles = (np.arange(CELLS) + 0.5) / CELLS * 2 * half - half
+    height = heights(deformed, middles)
+    slope_y, slope_x = np.gradient(height, middles, middles)
+    x, y = np.meshgrid(middles, middles)
+    target = [_float(values) for values in (x, y, height, slope_x, slope_y)]
+
+    radius = np.sqrt((np.arange(DISC_POINTS) + 0.5) / DISC_POINTS)  # a sunflower: equal areas
+    angle = _GOLDEN_ANGLE * np.arange(DISC_POINTS)
+    disc = _float(np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1))
+
+    index = dr.arange(mi.UInt32, n_led * CELLS * CELLS)
+    led, point = index // (CELLS * CELLS), index % (CELLS * CELLS)
+    here = [dr.gather(mi.Float, values, point) for values in target]
+    source = _Source.of(sensor, led)
+    weights = _float(basis.columns.T)
+
+    total = [mi.Float(0.0) for _ in range(count)]
+    number = mi.UInt32(0)
+
+    def more(number, *total):  # type: ignore[no-untyped-def]
+        return number < DISC_POINTS
+
+    def add(number, *total):  # type: ignore[no-untyped-def]
+        on_disc = dr.gather(mi.Point2f, disc, number)
+        for mirrored in (False, True):
+            flux, cosine = _arrives(sensor, source, on_disc, here, mirrored)
+            weight = weigh(weights, count, basis.columns.shape[1], cosine, flux > 0.0)
+            total = tuple(sum_ + flux * w for sum_, w in zip(total, weight, strict=True))
+        return number + 1, *total
+
+    total = list(dr.while_loop((number, *total), more, add))[1:]
+    dr.eval(total)
+    coarse = np.stack([np.asarray(layer).reshape(n_led, CELLS, CELLS) for layer in total], axis=1)
+    return refine(coarse.astype(np.float64) / DISC_POINTS, 2)
+
+
+@dataclass(frozen=True)
+class _Source:
+    """The LED of each lane: centre (along axis from the face, along the side, z), medium, étendue's flux, radius."""
+
+    axis_x: mi.Float
+    axis_y: mi.Float
+    along: mi.Float
+    z: mi.Float
+    gap: mi.Float  # air between disc and face, 0 if embedded
+    inset: mi.Float  # guide between face and disc, 0 if in air
+    index: mi.Float
+    radius: mi.Float
+    density: mi.Float  # F / (pi m²), W: the disc's area cancels against its mean over points
+
+    @staticmethod
+    def of(sensor: Sensor, led: mi.UInt32) -> _Source:
+        half, n = sensor.guide.width_mm / 2, sensor.guide.refractive_index
+        rows = []
+        for lamp in sensor.leds:
+            _, axis, tangent = led_frame(lamp, half)
+            in_air = lamp.coupling == "air"
+            medium = 1.0 if in_air else n
+            gap, inset = (lamp.gap_mm, 0.0) if in_air else (0.0, lamp.gap_mm)
+            density = lamp.flux_W / (np.pi * medium**2)
+            rows.append([axis[0], axis[1], lamp.along_mm, lamp.z_mm, gap, inset, medium, lamp.diameter_mm / 2, density])
+        return _Source(*(dr.gather(mi.Float, _float(column), led) for column in np.array(rows).T))
+
+
+def _arrives(
+    sensor: Sensor, source: _Source, on_disc: mi.Point2f, here: list[mi.Float], mirrored: bool
+) -> tuple[mi.Float, mi.Float]:
+    """Irradiance, W/mm², at the targets from one point of each disc, and the cosine of incidence there."""
+    x, y, height, slope_x, slope_y = here
+    guide, glass = sensor.guide, sensor.glass
+    half, n, n_glass = guide.width_mm / 2, guide.refractive_index, glass.refractive_index
+    side_y, disc_z = source.along + source.radius * on_disc.x, source.z + source.radius * on_disc.y
+    # the tangent of `led_frame` is (|axis_y|, |axis_x|)
+    along_axis = x * source.axis_x + y * source.axis_y + half - source.inset
+    along_side = x * dr.abs(source.axis_y) + y * dr.abs(source.axis_x) - side_y
+    up = height - disc_z
+    if mirrored:
+        up = (disc_z + guide.thickness_mm) + (height + guide.thickness_mm)
+    lit = along_axis > 1e-3
+
+    def follow(slope_y: mi.Float, slope_z: mi.Float) -> _Path:
+        through_glass = 2.0 * glass.thickness_mm if mirrored else 0.0
+        return _follow(source, n, n_glass, through_glass, up, along_axis, along_side, slope_y, slope_z)
+
+    # start from the ray inside the guide that a vanishing air gap would give
+    reach = dr.maximum(along_axis, 1e-3)
+    sine_y, sine_z = along_side / reach, up / reach
+    scale = n * dr.rsqrt(1.0 + dr.square(sine_y) + dr.square(sine_z))
+    tangential = dr.sqrt(dr.square(sine_y) + dr.square(sine_z)) * scale
+    allowed = dr.minimum(1.0, 0.98 * source.index / dr.maximum(tangential, 1e-6))
+    p_y, p_z = sine_y * scale * allowed, sine_z * scale * allowed
+    p_x = dr.sqrt(dr.maximum(dr.square(source.index) - dr.square(p_y) - dr.square(p_z), 1e-6))
+    t_y, t_z = p_y / p_x, p_z / p_x
+    for _ in range(_NEWTON_STEPS):
+        path = follow(t_y, t_z)
+        x_y, x_z, y_y, y_z = path.derivative
+        determinant = x_y * y_z - x_z * y_y
+        t_y = t_y - (y_z * path.error.x - x_z * path.error.y) / determinant
+        stepped = t_z - (x_y * path.error.y - y_y * path.error.x) / determinant
+        t_z = dr.maximum(stepped, 0.25 * t_z)  # upwards it stays
+    path = follow(t_y, t_z)
+
+    lit &= dr.abs(path.error.x) + dr.abs(path.error.y) < 1e-2
+    entry_z = disc_z - path.entry_z if mirrored else disc_z + path.entry_z
+    lit &= (entry_z > -guide.thickness_mm) & (dr.abs(side_y + path.entry_y) < half)
+    tangential2 = dr.square(path.p_y) + dr.square(path.p_z)
+    in_air = source.gap > 0.0
+    share = dr.select(in_air, 1.0 - _fresnel(mi.Float(1.0), mi.Float(n), tangential2), 1.0)
+    if mirrored:
+        level2 = dr.square(path.p_x) + dr.square(path.p_y)
+        through = 1.0 - _fresnel(mi.Float(n), mi.Float(n_glass), level2)
+        share *= dr.square(through) * _fresnel(mi.Float(n_glass), mi.Float(1.0), level2)
+    # the surface's slope turns its normal and lengthens its shadow
+    d_x = path.p_x * source.axis_x + path.p_y * dr.abs(source.axis_y)
+    d_y = path.p_x * source.axis_y + path.p_y * dr.abs(source.axis_x)
+    facing = path.p_z - d_x * slope_x - d_y * slope_y
+    cosine = facing * dr.rsqrt(1.0 + dr.square(slope_x) + dr.square(slope_y)) / n
+    flux = source.density * path.etendue * share * facing / path.p_z
+    lit &= facing > 0.0
+    return dr.select(lit, flux, 0.0), dr.select(lit, cosine, 1.0)
+
+
+def _follow(
+    source: _Source,
+    n: float,
+    n_glass: float,
+    through_glass: float,
+    up: mi.Float,
+    along_axis: mi.Float,
+    along_side: mi.Float,
+    t_y: mi.Float,
+    t_z: mi.Float,
+) -> _Path:
+    """A ray from its slopes at the disc to the target's height, with derivatives to the slopes."""
+    one = 1.0 + dr.square(t_y) + dr.square(t_z)
+    c = source.index * dr.rsqrt(one)
+    p_y, p_z = t_y * c, t_z * c
+    py_y, py_z = c * (1.0 + dr.square(t_z)) / one, -c * t_y * t_z / one
+    pz_y, pz_z = py_z, c * (1.0 + dr.square(t_y)) / one
+    p_x = dr.sqrt(dr.maximum(n**2 - dr.square(p_y) - dr.square(p_z), 1e-9))
+    px_y, px_z = -(p_y * py_y + p_z * pz_y) / p_x, -(p_y * py_z + p_z * pz_z) / p_x
+
+    run = (up - source.gap * t_z) / p_z  # length over index, inside the guide
+    run_y, run_z = -run * pz_y / p_z, -run * pz_z / p_z - source.gap / p_z
+    if through_glass > 0.0:
+        g2 = dr.maximum(n_glass**2 - n**2 + dr.square(p_z), 1e-9)
+        below = through_glass * dr.rsqrt(g2)
+        factor = -below * p_z / g2
+        run, run_y, run_z = run + below, run_y + factor * pz_y, run_z + factor * pz_z
+
+    x_y, x_z = px_y * run + p_x * run_y, px_z * run + p_x * run_z
+    y_y, y_z = source.gap + py_y * run + p_y * run_y, py_z * run + p_y * run_z
+    error = mi.Vector2f(p_x * run - along_axis, source.gap * t_y + p_y * run - along_side)
+    etendue = dr.square(source.index / one) / dr.abs(x_y * y_z - x_z * y_y)
+    return _Path(p_y, p_z, p_x, source.gap * t_y, source.gap * t_z, error, (x_y, x_z, y_y, y_z), etendue)
+
+
+def _fresnel(n_in: mi.Float, n_out: mi.Float, tangential2: mi.Float) -> mi.Float:
+    """Unpolarised Fresnel reflectance for squared tangential index; 1 beyond the critical angle (key born1999)."""
+    total = tangential2 >= dr.square(n_out)
+    a = dr.sqrt(dr.maximum(dr.square(n_in) - tangential2, 0.0))
+    b = dr.sqrt(dr.maximum(dr.square(n_out) - tangential2, 0.0))
+    s = (a - b) / dr.maximum(a + b, 1e-12)
+    p = (dr.square(n_out) * a - dr.square(n_in) * b) / dr.maximum(dr.square(n_out) * a + dr.square(n_in) * b, 1e-12)
+    return dr.select(total, 1.0, 0.5 * (dr.square(s) + dr.square(p)))
+
+
+def _float(values: Array) -> mi.Float:
+    return mi.Float(np.ascontiguousarray(values, dtype=np.float32).ravel())

@@ -1,0 +1,229 @@
+"""Designs: the paper's sensor as it is shipped, its schema, and one plain line for every mistake."""
+
+import dataclasses
+import json
+import tomllib
+from importlib.resources import files
+
+import jsonschema
+import pytest
+
+from fem import Inclusion
+from twin.design import Design, DesignError, design_schema, load_design, parse_design, shipped_designs
+
+TSIS = files("assets").joinpath("designs", "tsis.toml").read_text(encoding="utf-8")
+
+
+@pytest.fixture
+def data():
+    return tomllib.loads(TSIS)
+
+
+def test_the_shipped_design_is_the_papers_sensor():
+    design = load_design("tsis")
+    assert shipped_designs() == ["tsis"]
+    assert design.name == "tsis"
+    assert design.waveguide.width_mm == 25 and design.waveguide.thickness_mm == 10
+    assert [(layer.thickness_mm, layer.modulus_kPa) for layer in design.waveguide.layers] == [
+        (2, 27),
+        (3, 61),
+        (5, 156),
+    ]
+    assert sorted(led.side for led in design.leds) == ["+x", "+y", "-x", "-y"]
+    assert {(led.diameter_mm, led.coupling) for led in design.leds} == {(1.5, "air")}
+    camera = design.camera
+    assert (camera.columns, camera.rows, camera.pixel_um, camera.bits) == (768, 492, (8.4, 9.8), 8)
+    assert camera.field_height_mm == pytest.approx(18.685, abs=1e-3)  # 25 mm x 4.8216 / 6.4512
+    assert design.specimen.modulus_kPa == 5
+
+
+def test_index_of_the_guide_is_sylgards():
+    """Schneider 2009: n² = 1 + 1.0093 L²/(L² - 0.013185), L in µm."""
+    design = load_design("tsis")
+    square = (design.light.wavelength_nm / 1000) ** 2
+    expected = (1 + 1.0093 * square / (square - 0.013185)) ** 0.5
+    assert design.waveguide.refractive_index == pytest.approx(expected, abs=5e-5)
+
+
+def test_albedo_is_flocks():
+    """Flock 1989, matched index, with reduced scattering 1 and absorption 0.02 per mm."""
+    a = 1 / 1.02
+    expected = a / (1 + 2 * (1 - a) + 5 / 3 * (3 * (1 - a)) ** 0.5)
+    assert load_design("tsis").specimen.albedo == pytest.approx(expected, abs=2e-3)
+
+
+def test_every_value_of_the_shipped_design_has_a_comment():
+    """A comment on the line, on the ones above it, or (for the plain repeats of an LED) its own short one."""
+    lines = TSIS.splitlines()
+    for number, line in enumerate(lines):
+        if "=" in line and not line.startswith("#") and not line.startswith(("name", "description")):
+            assert "#" in line or lines[number - 1].startswith("#"), f"line {number + 1}: {line}"
+
+
+def test_rooms_get_their_own_input():
+    design = load_design("tsis")
+    assert design.probe().layers == design.waveguide.layers
+    assert (design.slab().thickness_mm, design.slab().modulus_kPa) == (30, 5)
+    sensor = design.sensor()
+    assert (sensor.guide.thickness_mm, sensor.guide.width_mm) == (10, 25)
+    assert sensor.tissue.refractive_index == 1.40
+    by_hand = 1 / ((1 - 0.49**2) / 27 + (1 - 0.49**2) / 5)  # 1/E* of PDMS against tissue
+    assert sensor.effective_modulus_kPa == pytest.approx(by_hand, rel=1e-12)
+
+
+def test_designs_are_frozen_and_replaced_ones_are_checked_again():
+    design = load_design("tsis")
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        design.name = "other"
+    wider = dataclasses.replace(design.camera, field_of_view_mm=26.0)
+    with pytest.raises(ValueError, match=r"camera\.field_of_view_mm"):
+        dataclasses.replace(design, camera=wider)
+
+
+def test_schema_is_valid_describes_every_field_and_takes_the_shipped_design(data):
+    schema = design_schema()
+    jsonschema.Draft202012Validator.check_schema(schema)
+    jsonschema.Draft202012Validator(schema).validate(data)
+    objects = [schema, *schema["$defs"].values()]
+    for node in objects:
+        assert node["additionalProperties"] is False
+        for name, field in node["properties"].items():
+            assert field.get("description", "").strip(), f"{node['title']}.{name} has no description"
+
+
+def test_schema_refuses_what_the_reader_refuses(data):
+    data["camera"]["bits"] = 7
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.Draft202012Validator(design_schema()).validate(data)
+    with pytest.raises(DesignError):
+        parse_design(data)
+
+
+def test_the_schema_beside_the_shipped_designs_is_current():
+    """Editors read it; print it anew with: twin schema > assets/designs/schema.json"""
+    stored = files("assets").joinpath("designs", "schema.json").read_text(encoding="utf-8")
+    assert json.loads(stored) == design_schema()
+    assert TSIS.startswith("#:schema ./schema.json\n")
+
+
+def test_a_design_needs_only_what_has_no_sensible_default(data):
+    for section in ("light", "glass", "surface", "press", "signal", "description"):
+        del data[section]
+    for name in list(data["camera"]):
+        if name not in ("columns", "rows", "pixel_um", "field_of_view_mm"):
+            del data["camera"][name]
+    data["leds"] = [{"side": "+x"}]
+    design = parse_design(data)
+    assert design.press.indentation_mm == (2.0,)
+    assert design.signal.displacement_um == 2.0 and design.signal.counts == 10.0
+
+
+def changed(data, path, value):
+    """Set (or with ... delete) the value at a dotted path."""
+    *steps, last = [int(step) if step.isdigit() else step for step in path.split(".")]
+    node = data
+    for step in steps:
+        node = node[step]
+    if value is ...:
+        del node[last]
+    else:
+        node[last] = value
+    return data
+
+
+BAD = [
+    # field, value (... is absent), received and allowed as the line must say
+    ("camera.colums", 768, "the unknown key 'colums' = 768", "one of columns, rows"),
+    ("camera.columns", 768.5, "768.5", "an integer >= 1"),
+    ("camera.columns", "768", "'768'", "an integer >= 1"),
+    ("camera.columns", ..., "nothing", "an integer >= 1"),
+    ("camera.bits", 7, "7", "an integer >= 8 and <= 16"),
+    ("camera.bits", True, "True", "an integer >= 8 and <= 16"),
+    ("camera.pixel_um", [8.4], "nothing", "a number > 0"),
+    ("camera.pixel_um", 8.4, "8.4", "a list of 2, each a number > 0"),
+    ("camera.field_of_view_mm", 26.0, "26.0", "within the guide's 25 mm"),
+    ("camera.offset_dn", 255.0, "255.0", "below the 255 counts of 8 bits"),
+    ("camera", ..., "nothing", "a table with the keys columns, rows"),
+    ("camera", 3, "3", "a table with the keys columns, rows"),
+    ("waveguide.layers.1.thickness_mm", -3.0, "-3.0", "a number > 0"),
+    ("waveguide.layers.0.poisson", 0.5, "0.5", "a number >= 0 and <= 0.4999"),
+    ("waveguide.layers", [], "[]", "a list of 1 to 16"),
+    ("waveguide.refractive_index", 0.9, "0.9", "a number >= 1 and <= 4"),
+    ("waveguide.width_mm", float("nan"), "nan", "a finite number > 0"),
+    ("waveguide.width_mm", float("inf"), "inf", "a finite number > 0"),
+    ("waveguide.width_mm", "wide", "'wide'", "a number > 0"),
+    ("leds.2.along_mm", 12.0, "12.0", "-11.75 to 11.75 mm"),
+    ("leds.2.along_mm", float("-inf"), "-inf", "a finite number"),
+    ("leds.1.z_mm", -0.5, "-0.5", "-9.25 to -0.75 mm"),
+    ("leds.1.z_mm", -11.0, "-11.0", "-9.25 to -0.75 mm"),
+    ("leds.0.diameter_mm", 11.0, "11.0", "25 x 10 mm"),
+    ("leds.0.side", "top", "'top'", "one of '+x', '-x', '+y', '-y'"),
+    ("leds.0.coupling", "glue", "'glue'", "one of 'air', 'embedded'"),
+    ("leds", [], "[]", "a list of 1 to 64"),
+    ("surface.gap_index", 1.5, "1.5", "a number below the guide's index 1.4336"),
+    ("specimen.width_mm", 20.0, "20.0", "at least the waveguide's width of 25 mm"),
+    ("specimen.albedo", 1.0, "1.0", "a number >= 0 and < 1"),
+    ("press.indentation_mm", [2.0, 7.0], "7.0", "a number > 0 and <= 6 mm"),
+    ("press.indentation_mm", 2.0, "2.0", "a list of 1 or more, each a number > 0"),
+    ("signal.counts", 0, "0", "a number > 0"),
+    ("light.wavelength_nm", 200, "200", "a number >= 350 and <= 1100"),
+    ("name", 5, "5", "a text in quotes"),
+]
+
+
+@pytest.mark.parametrize(("path", "value", "received", "allowed"), BAD)
+def test_every_mistake_is_one_line_with_file_field_value_and_what_is_allowed(
+    data, path, value, received, allowed
+):
+    with pytest.raises(DesignError) as caught:
+        parse_design(changed(data, path, value), "my.toml")
+    line = str(caught.value)
+    assert "\n" not in line
+    assert line.startswith(f"my.toml: {path}")
+    assert f"received {received}" in line
+    assert allowed in line.split("; allowed ")[1]
+
+
+def test_further_mistakes_are_counted(data):
+    data["camera"]["bits"], data["camera"]["rows"], data["glass"]["thickness_mm"] = 7, 0, -1
+    with pytest.raises(DesignError, match=r"camera.rows: received 0; allowed .* \(\+2 more\)$"):
+        parse_design(data)
+
+
+def test_embedded_led_stays_in_its_half_of_the_guide(data):
+    data["leds"][0] |= {"coupling": "embedded", "gap_mm": 12.5}
+    with pytest.raises(DesignError, match=r"leds.0.gap_mm: received 12.5; allowed less than 12.5 mm"):
+        parse_design(data)
+    data["leds"][0]["coupling"] = "air"
+    parse_design(data)
+
+
+@pytest.mark.parametrize(
+    ("inclusion", "field"),
+    [
+        (Inclusion(10, 20, 100), "inclusion.depth"),  # its far side touches the chest wall at 30 mm
+        (Inclusion(26, 5, 100), "inclusion.size"),
+        (Inclusion(10, 5, 100, offset=(25.0, 0.0)), "inclusion.offset"),  # touches the slab's side at 30 mm
+        (Inclusion(10, 5, 100, offset=(0.0, -40.0)), "inclusion.offset"),
+    ],
+)
+def test_inclusion_stays_in_the_slab(inclusion, field):
+    with pytest.raises(DesignError) as caught:
+        load_design("tsis").check_inclusion(inclusion)
+    assert caught.value.field == field
+
+
+def test_press_is_limited_to_a_fifth_of_the_slab():
+    design: Design = load_design("tsis")
+    design.check_indentation(6.0)
+    for depth in (6.001, 0.0, -1.0, float("nan")):
+        with pytest.raises(DesignError, match=r"press\.indentation_mm"):
+            design.check_indentation(depth)
+
+
+def test_a_path_is_read_and_a_missing_one_is_named(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text(TSIS.replace('name = "tsis"', 'name = "mine"'), encoding="utf-8")
+    assert load_design(path).name == "mine"
+    with pytest.raises(DesignError, match=r"absent.toml'; allowed a shipped design \(tsis\) or a TOML file"):
+        load_design(tmp_path / "absent.toml")

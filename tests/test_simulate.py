@@ -1,0 +1,173 @@
+"""The chain from press to picture, at preview quality: seeds, levels, taring, what a frame says of itself."""
+
+import dataclasses
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fem
+import twin
+from estimation import scalars
+
+HERE = Path(__file__).resolve().parent
+INCLUSION = twin.Inclusion(size=10, depth=5, modulus=100)
+
+
+def small(columns=96, rows=61):
+    """The shipped design with a coarse camera: the same field of view in fewer, larger pixels."""
+    design = twin.load_design("tsis")
+    scale = 768 / columns
+    camera = dataclasses.replace(
+        design.camera, columns=columns, rows=rows, pixel_um=(8.4 * scale, 9.8 * scale)
+    )
+    # Larger pixels gather more light: keep the counts those of the shipped camera.
+    camera = dataclasses.replace(camera, exposure_ms=camera.exposure_ms / scale**2)
+    return dataclasses.replace(design, camera=camera)
+
+
+@pytest.fixture(scope="module")
+def design():
+    return small()
+
+
+@pytest.fixture(scope="module")
+def levels(design):
+    return twin.simulate(design, INCLUSION, [1.0, 2.0], quality="preview", seed=7)
+
+
+def test_one_level_gives_a_frame_and_several_a_list(design, levels):
+    assert [frame.press["indentation_mm"] for frame in levels] == pytest.approx([1.0, 2.0])
+    frame = twin.simulate(design, INCLUSION, quality="preview", seed=7)
+    assert isinstance(frame, twin.Frame)
+    assert frame.press["indentation_mm"] == 2.0  # the design's
+
+
+def test_a_level_does_not_depend_on_the_others_and_a_seed_gives_the_same_bytes(design, levels):
+    alone = twin.simulate(design, INCLUSION, 2.0, quality="preview", seed=7)
+    for name in ("image", "reference", "radiance", "pressure", "displacement_z"):
+        assert getattr(alone, name).tobytes() == getattr(levels[1], name).tobytes(), name
+    for name in ("displacement", "pressure", "displacement_0", "pressure_0"):
+        assert alone.surface.point_data[name].tobytes() == levels[1].surface.point_data[name].tobytes(), name
+
+
+HASHES = """
+import hashlib, sys
+sys.path[:0] = sys.argv[2:]
+from scenes import backend
+from test_simulate import INCLUSION, small, twin
+backend.use("auto")
+backend.threads(int(sys.argv[1]))
+frame = twin.simulate(small(), INCLUSION, 2.0, quality="preview", seed=7)
+arrays = [frame.image, frame.reference, frame.radiance, *frame.surface.point_data.values()]
+print(*(hashlib.sha256(array.tobytes()).hexdigest() for array in arrays))
+"""
+
+
+def test_one_thread_and_two_give_the_same_bytes():
+    found = set()
+    for threads in ("1", "2"):
+        environment = {**os.environ, "OMP_NUM_THREADS": threads, "OPENBLAS_NUM_THREADS": threads}
+        command = [sys.executable, "-c", HASHES, threads, str(HERE), str(HERE.parent)]
+        ended = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+        found.add(ended.stdout)
+    assert len(found) == 1 and len(found.pop().split()) >= 7
+
+
+def test_another_seed_gives_other_noise_in_light_and_camera(design, levels):
+    other = twin.simulate(design, INCLUSION, 2.0, quality="preview", seed=8)
+    assert not np.array_equal(other.image, levels[1].image)
+    assert not np.array_equal(other.radiance, levels[1].radiance)
+    assert np.array_equal(other.pressure, levels[1].pressure)  # mechanics draw no random numbers
+
+
+def test_shapes_and_kinds_are_as_promised(design, levels):
+    frame, shape = levels[1], (61, 96)
+    assert frame.image.shape == shape and frame.image.dtype == np.uint8
+    assert frame.radiance.shape == (4, *shape) and frame.radiance.dtype == np.float32
+    assert frame.tared.shape == shape
+    assert (frame.radiance >= 0).all()
+    for name in ("displacement", "pressure", "displacement_0", "pressure_0"):
+        assert name in frame.surface.point_data
+    assert frame.design is design and frame.inclusion is INCLUSION and frame.seed == 7
+
+
+def test_scalars_are_those_of_the_frames_own_arrays(levels):
+    for frame in levels:
+        signal = frame.design.signal
+        assert frame.tsis["raw"] == scalars(frame.image, signal.counts)
+        assert frame.tsis["tared"] == scalars(frame.image - frame.reference.astype(float), signal.counts)
+        expected = fem.scalars(frame.surface, signal.displacement_um)
+        assert (frame.fem["raw"], frame.fem["tared"]) == (expected["raw"], expected["tared"])
+
+
+def test_mechanics_scale_with_the_press(levels):
+    """Small strain is linear: twice the indentation, twice the force and the tared displacement."""
+    one, two = levels
+    assert two.press["force_N"] == pytest.approx(2 * one.press["force_N"], rel=1e-12)
+    assert two.fem["tared"]["max_mm"] == pytest.approx(2 * one.fem["tared"]["max_mm"], rel=1e-9)
+    assert two.fem["min_pressure_kPa"] == pytest.approx(2 * one.fem["min_pressure_kPa"], rel=1e-9)
+
+
+def test_the_inclusion_shows_in_the_middle_of_the_tared_picture(levels):
+    frame = levels[1]
+    signal = np.clip(frame.tared.astype(float) - frame.design.signal.counts, 0, None)
+    assert signal.sum() > 0
+    rows, columns = np.indices(signal.shape)
+    # Within 1 mm (4 pixels) of the middle, where the inclusion lies.
+    assert (columns * signal).sum() / signal.sum() == pytest.approx(47.5, abs=4)
+    assert (rows * signal).sum() / signal.sum() == pytest.approx(30, abs=4)
+
+
+def test_without_inclusion_the_tared_picture_is_noise(design):
+    frame = twin.simulate(design, None, 2.0, quality="preview", seed=7)
+    assert frame.fem["tared"] == {"max_mm": 0.0, "total_mm3": 0.0, "area_mm2": 0.0}
+    counts = frame.tared.astype(float)
+    assert abs(counts.mean()) < 5 * counts.std() / np.sqrt(counts.size)
+    assert frame.tsis["tared"]["area_px"] < 0.001 * counts.size
+
+
+def test_a_press_by_force_has_that_force(design, levels):
+    frame = twin.simulate(design, INCLUSION, force=levels[1].press["force_N"], quality="preview")
+    assert frame.press["force_N"] == pytest.approx(levels[1].press["force_N"], rel=1e-9)
+    assert frame.press["indentation_mm"] == pytest.approx(2.0, rel=1e-9)
+
+
+def test_camera_noise_differs_between_levels_but_not_its_fixed_pattern(design):
+    """Averaging levels must average noise away: the draws of two levels are unrelated."""
+    frames = twin.simulate(design, None, [2.0, 2.000001], quality="preview", seed=3)
+    first, second = (frame.tared.astype(float).ravel() for frame in frames)
+    assert abs(np.corrcoef(first, second)[0, 1]) < 5 / np.sqrt(first.size)
+
+
+def test_progress_runs_from_0_to_1_through_named_stages(design):
+    told = []
+    tell = lambda stage, done: told.append((stage, done))  # noqa: E731
+    twin.simulate(design, INCLUSION, [1.0, 3.0], quality="preview", progress=tell)
+    done = [share for _, share in told]
+    assert done == sorted(done) and done[-1] == 1.0 and done[0] >= 0
+    assert {stage for stage, _ in told} == {"mechanics", "light 1 of 2", "light 2 of 2"}
+
+
+@pytest.mark.parametrize(
+    ("options", "field"),
+    [
+        ({"indentation": 2.0, "force": 1.0}, "press"),
+        ({"indentation": -1.0}, "press.indentation_mm"),
+        ({"indentation": [2.0, 7.0]}, "press.indentation_mm"),
+        ({"indentation": []}, "press.indentation_mm"),
+        ({"indentation": "deep"}, "press.indentation_mm"),
+        ({"force": float("inf")}, "press.force_N"),
+        ({"force": 2.0}, "press.force_N"),  # 2 N presses 7 mm deep
+        ({"seed": -1}, "seed"),
+        ({"seed": 1.5}, "seed"),
+    ],
+)
+def test_impossible_presses_are_refused_in_one_line(design, options, field):
+    with pytest.raises(twin.DesignError) as caught:
+        twin.simulate(design, INCLUSION, **{"quality": "preview", **options})
+    assert caught.value.field == field
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,148 @@
+"""What a frame leaves on disk: every file, whole or not at all, and the same bytes for the same seed."""
+
+import hashlib
+import json
+import os
+import signal
+
+import numpy as np
+import pytest
+import pyvista
+from test_simulate import INCLUSION, small
+
+import twin
+import twin.cli
+from scenes.exr import read_exr, read_png
+from twin.frame import FILES, holds_frames, write_frames
+
+FRAME_KEYS = {"inclusion", "press", "fem", "tsis", "design", "seed", "versions", "sha256"}
+RUN = ["simulate", "--size", "10", "--depth", "5", "--modulus", "100", "--out", "out"]
+
+
+@pytest.fixture
+def plain_sheet(monkeypatch):
+    """Draw no sheet where a test is not about it: it takes seconds."""
+    monkeypatch.setattr("twin.pictures.overview", lambda frame, path: path.write_bytes(b"sheet"))
+
+
+@pytest.fixture(scope="module")
+def frame():
+    return twin.simulate(small(), INCLUSION, 2.0, quality="preview", seed=7)
+
+
+@pytest.fixture(scope="module")
+def folder(frame, tmp_path_factory):
+    return frame.write(tmp_path_factory.mktemp("frames") / "new" / "out")
+
+
+def test_every_file_is_there_and_holds_the_frames_arrays(frame, folder):
+    assert {path.name for path in folder.iterdir()} == FILES
+    layers = read_exr(folder / "frame.exr")
+    assert set(layers) == {"led.0", "led.1", "led.2", "led.3", "pressure", "displacement.z"}
+    assert np.array_equal(layers["led.2"], frame.radiance[2])
+    assert np.array_equal(layers["pressure"], frame.pressure)
+    assert np.array_equal(layers["displacement.z"], frame.displacement_z)
+    assert np.array_equal(read_png(folder / "image.png"), frame.image)
+    assert np.array_equal(read_exr(folder / "reference.exr")["counts"], frame.reference)
+    assert np.array_equal(read_png(folder / "reference.png"), np.rint(frame.reference))
+    assert np.array_equal(read_png(folder / "tared.png"), np.clip(np.rint(frame.tared + 128), 0, 255))
+    surface = pyvista.read(folder / "surface.vtp")
+    for name in ("displacement", "pressure", "displacement_0", "pressure_0"):
+        assert np.array_equal(surface.point_data[name], frame.surface.point_data[name])
+
+
+def test_frame_json_has_exactly_the_promised_keys(frame, folder):
+    record = json.loads((folder / "frame.json").read_text(encoding="utf-8"))
+    assert set(record) == FRAME_KEYS
+    assert record["inclusion"] == {"size_mm": 10, "depth_mm": 5, "modulus_kPa": 100, "offset_mm": [0, 0]}
+    assert set(record["press"]) == {"indentation_mm", "force_N"}
+    assert set(record["fem"]) == {"raw", "tared", "min_pressure_kPa", "dof", "seconds"}
+    assert set(record["fem"]["raw"]) == set(record["fem"]["tared"]) == {"max_mm", "total_mm3", "area_mm2"}
+    assert set(record["tsis"]) == {"raw", "tared", "seconds", "noise_percent"}
+    assert set(record["tsis"]["raw"]) == set(record["tsis"]["tared"]) == {"max_dn", "total_dn", "area_px"}
+    assert (record["design"], record["seed"]) == ("tsis", 7)
+    assert record["tsis"]["tared"] == frame.tsis["tared"]
+    assert {"python", "mitsuba", "numpy"} <= set(record["versions"])
+
+
+def test_checksums_are_of_every_other_file(folder):
+    record = json.loads((folder / "frame.json").read_text(encoding="utf-8"))
+    found = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.iterdir()}
+    del found["frame.json"]
+    assert record["sha256"] == found
+
+
+def test_the_same_seed_writes_the_same_bytes(folder, tmp_path):
+    again = twin.simulate(small(), INCLUSION, 2.0, quality="preview", seed=7).write(tmp_path / "again")
+    for name in FILES - {"frame.json"}:
+        assert (again / name).read_bytes() == (folder / name).read_bytes(), name
+
+
+def test_several_frames_go_into_numbered_folders_and_replace_an_earlier_result(frame, tmp_path, plain_sheet):
+    out = tmp_path / "levels"
+    frame.write(out)
+    write_frames([frame, frame], out)
+    assert sorted(path.name for path in out.iterdir()) == ["00", "01"]
+    assert holds_frames(out)
+    frame.write(out)
+    assert {path.name for path in out.iterdir()} == FILES
+    assert list(tmp_path.iterdir()) == [out]
+
+
+def test_a_folder_with_anything_else_is_left_alone(frame, tmp_path, plain_sheet):
+    out = frame.write(tmp_path / "out")
+    (out / "notes.txt").write_text("mine")
+    before = {path: path.read_bytes() for path in out.iterdir()}
+    with pytest.raises(twin.DesignError, match="holds something else"):
+        frame.write(out)
+    assert {path: path.read_bytes() for path in out.iterdir()} == before
+    assert list(tmp_path.iterdir()) == [out]
+
+
+def test_no_inclusion_is_null(tmp_path):
+    out = twin.simulate(small(), None, 2.0, quality="preview").write(tmp_path / "flat")
+    assert json.loads((out / "frame.json").read_text(encoding="utf-8"))["inclusion"] is None
+
+
+class DiskFull(OSError):
+    """What the system raises where nothing more fits."""
+
+
+def interrupt(*args, **options):
+    raise KeyboardInterrupt
+
+
+def terminate(*args, **options):
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+def fill_the_disk(*args, **options):
+    raise DiskFull(28, "No space left on device")
+
+
+@pytest.mark.parametrize(("accident", "status"), [(interrupt, 130), (terminate, 130), (fill_the_disk, 1)])
+@pytest.mark.parametrize("earlier", [False, True])
+def test_an_accident_leaves_nothing_new_behind(
+    accident, status, earlier, frame, tmp_path, monkeypatch, capfd, plain_sheet
+):
+    monkeypatch.chdir(tmp_path)
+    out = tmp_path / "out"
+    if earlier:
+        frame.write(out)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    monkeypatch.setattr(twin.cli, "simulate", lambda *args, **options: [frame])
+    monkeypatch.setattr("twin.pictures.overview", accident)  # the last file but one
+    assert twin.cli.main(RUN) == status
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+    assert list(tmp_path.iterdir()) == ([out] if earlier else [])
+    error = capfd.readouterr().err.strip().splitlines()
+    assert "nothing was written" in error[-1] and not any("Traceback" in line for line in error)
+
+
+def test_the_command_line_writes_what_python_returns(frame, tmp_path, monkeypatch, capfd, plain_sheet):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(twin.cli, "simulate", lambda *args, **options: [frame, frame])
+    assert twin.cli.main([*RUN, "--indentation", "1", "2"]) == 0
+    assert {path.name for path in (tmp_path / "out" / "01").iterdir()} == FILES
+    printed = capfd.readouterr().out
+    assert "10 mm across" in printed and "tared" in printed and "overview.png" in printed

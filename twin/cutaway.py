@@ -1,0 +1,167 @@
+"""Panels of the overview sheet along y = 0: the cut through probe and tissue, and the profiles over x."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
+from matplotlib.patches import Rectangle
+from matplotlib.tri import LinearTriInterpolator, Triangulation
+from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
+
+from twin.panels import FAINT, INCLUSION, INK, INNER, LED, Pictured, quads, scale_bar, triangles
+
+TISSUE, GLASS, WALL, PRESSURE = "#f3ddcf", "#d5e8df", "#d0d0d0", "#2b6ca3"
+LAYERS = ("#deebf7", "#9ecae1", "#4a90c4", "#2b6ca3", "#1f4e79")
+
+
+def draw_cut(axes: Axes, frame: Pictured, letter: str) -> None:
+    """Plane y = 0 in the probe's frame: glass at rest, chest wall pushed towards it, true to scale."""
+    design, mesh = frame.design, frame.cut
+    indentation = frame.press["indentation_mm"]
+    layers, slab = design.waveguide.layers, design.specimen
+    half, wide = design.waveguide.width_mm / 2, slab.width_mm / 2
+    colours = np.array([TISSUE, INCLUSION, *(LAYERS[i % len(LAYERS)] for i in range(len(layers)))])
+    material = np.asarray(mesh.cell_data["material"]).astype(int)
+    if frame.inclusion is None:  # the mesh may keep its sphere of cells; the tissue has none
+        material = np.where(material == 1, 0, material)
+    moved = (np.asarray(mesh.points) + np.asarray(mesh.point_data["displacement"]))[:, [0, 2]]
+    fill = list(colours[material])
+    axes.add_collection(
+        PolyCollection(moved[quads(mesh)], facecolors=fill, edgecolors="#00000030", linewidths=0.2)
+    )
+    bottom = -sum(layer.thickness_mm for layer in layers)
+    glass, wall = design.glass.thickness_mm, slab.thickness_mm - indentation
+    edge: dict[str, Any] = {"edgecolor": INK, "lw": 0.5}
+    axes.add_patch(Rectangle((-half, bottom - glass), 2 * half, glass, facecolor=GLASS, **edge))
+    hatch: dict[str, Any] = {"facecolor": WALL, "edgecolor": "#9a9a9a", "hatch": "////", "lw": 0.5}
+    axes.add_patch(Rectangle((-wide, wall), 2 * wide, 2.5, **hatch))
+    for led in design.leds:
+        if led.side not in ("+x", "-x"):
+            continue
+        sign = 1 if led.side == "+x" else -1
+        face = half + (led.gap_mm if led.coupling == "air" else -led.gap_mm)
+        corner = (min(sign * face, sign * (face + 0.8)), led.z_mm - led.diameter_mm / 2)
+        axes.add_patch(Rectangle(corner, 0.8, led.diameter_mm, facecolor=LED, zorder=4, **edge))
+    _name_the_parts(axes, frame, bottom, wall)
+    axes.set_xlim(-wide - 3, wide + 6)
+    axes.set_ylim(bottom - glass - 2.6, slab.thickness_mm + 1.5)
+    axes.set_aspect("equal", anchor="N")
+    axes.set_xlabel("x, mm")
+    axes.set_ylabel("z, mm (into the tissue)")
+    axes.set_title(f"{letter}  Cut at y = 0 under a press of {indentation:.2f} mm (deformation × 1)")
+
+
+def _name_the_parts(axes: Axes, frame: Pictured, bottom: float, wall: float) -> None:
+    design = frame.design
+    slab, glass = design.specimen, design.glass.thickness_mm
+    half, left = design.waveguide.width_mm / 2, -slab.width_mm / 2 + 1.5
+    axes.text(left, wall - 1.2, f"tissue {slab.modulus_kPa:g} kPa", va="top", fontsize=7.5)
+    paper: dict[str, Any] = {"facecolor": "white", "edgecolor": "none", "pad": 1.5}
+    axes.text(0, wall + 1.15, "chest wall (fixed)", ha="center", va="center", bbox=paper)
+    if frame.inclusion is not None:
+        _name_the_inclusion(axes, frame)
+    parts, top = [], 0.0
+    for layer in design.waveguide.layers:
+        text = f"PDMS {layer.modulus_kPa:g} kPa, {layer.thickness_mm:g} mm"
+        parts.append((top - layer.thickness_mm / 2, text))
+        top -= layer.thickness_mm
+    parts.append((bottom - glass / 2, f"glass {glass:g} mm"))
+    arrow: dict[str, Any] = {"arrowstyle": "-", "lw": 0.5, "color": FAINT, "shrinkA": 0, "shrinkB": 0}
+    free = -3.6  # below the tissue, which sags beside the probe
+    for z, text in parts:
+        height = min(z, free)
+        axes.annotate(text, (half, z), (half + 3, height), va="center", fontsize=6, arrowprops=arrow)
+        free = height - 2.4
+    lit = [led for led in design.leds if led.side == "-x"]
+    if lit:
+        axes.text(-half - 2, lit[0].z_mm, "LED", ha="right", va="center")
+    below = f"camera {design.camera.distance_mm:g} mm below"
+    axes.text(0, bottom - glass - 0.5, below, fontsize=6.5, ha="center", va="top", color=FAINT)
+    scale_bar(axes, left, bottom - glass + 0.4, 10.0, INK)
+
+
+def _name_the_inclusion(axes: Axes, frame: Pictured) -> None:
+    found, mesh = frame.inclusion, frame.cut
+    text = f"inclusion\n{found.modulus:g} kPa"
+    inside = quads(mesh)[np.asarray(mesh.cell_data["material"]) == 1]
+    if not inside.size:  # off the plane of the cut
+        return
+    moved = (np.asarray(mesh.points) + np.asarray(mesh.point_data["displacement"]))[np.unique(inside)]
+    (left, _, low), (right, _, high) = moved.min(axis=0), moved.max(axis=0)
+    middle = (low + high) / 2
+    if right - left >= 7:
+        place, side, colour = (left + right) / 2, "center", "white"
+    else:
+        place, side, colour = right + 1, "left", INCLUSION
+    axes.text(place, middle, text, ha=side, va="center", color=colour, linespacing=1.1)
+
+
+def draw_profiles(rows: Sequence[Axes], frame: Pictured, letter: str) -> None:
+    """Cause to effect along y = 0, in three rows: tared displacement, pressure, tared counts.
+
+    Dots are the nodes of the mechanics; the picture is the mean of 17 rows.
+    """
+    data, signal, found = frame.surface.point_data, frame.design.signal, frame.inclusion
+    points = np.asarray(frame.surface.points, float)
+    half = frame.design.waveguide.width_mm / 2
+    nodes = np.flatnonzero(np.abs(points[:, 1]) < 1e-6 * half)
+    x = np.linspace(-half, half, 401)[1:-1]
+
+    pushed = np.asarray(data["displacement_0"])[:, 2] - np.asarray(data["displacement"])[:, 2]
+    rows[0].plot(x, 1e3 * _along_x(frame, pushed, x), color=INCLUSION, lw=1.2)
+    rows[0].plot(points[nodes, 0], 1e3 * pushed[nodes], ".", color=INCLUSION, ms=2.5)
+    _threshold(rows[0], half, signal.displacement_um, f"k = {signal.displacement_um:g} µm")
+    rows[0].set_ylabel("pushed in\nµm, tared", fontsize=6.5)
+
+    pressure, pressure_0 = (np.asarray(data[name], float) for name in ("pressure", "pressure_0"))
+    if found is not None:
+        line: dict[str, Any] = {"color": FAINT, "lw": 1.0, "ls": "--", "label": "without inclusion"}
+        rows[1].plot(x, _along_x(frame, pressure_0, x), **line)
+    label = "with inclusion" if found is not None else "plain tissue"
+    rows[1].plot(x, _along_x(frame, pressure, x), color=PRESSURE, lw=1.2, label=label)
+    rows[1].plot(points[nodes, 0], pressure[nodes], ".", color=PRESSURE, ms=2.5)
+    inner = np.abs(points[:, :2]).max(axis=1) < INNER * half
+    rows[1].set_ylim(0, 1.15 * max(pressure[inner].max(), pressure_0[inner].max()))
+    rows[1].set_ylabel("pressure\nkPa", fontsize=6.5)
+    rows[1].legend(fontsize=6, frameon=False, loc="lower center", ncols=2, handlelength=2.2, borderpad=0)
+
+    counts = np.asarray(frame.tared, np.float64)
+    middle, width = counts.shape[0] // 2, frame.design.camera.field_of_view_mm
+    band = counts[max(middle - 8, 0) : middle + 9].mean(axis=0)
+    columns = ((np.arange(counts.shape[1]) + 0.5) / counts.shape[1] - 0.5) * width
+    rows[2].plot(columns, uniform_filter1d(band, 5), color="#4d4d4d", lw=1.2)
+    _threshold(rows[2], half, signal.counts, f"k = {signal.counts:g}")
+    rows[2].set_ylabel("picture\ncounts, tared", fontsize=6.5)
+    rows[2].set_xlabel("x, mm")
+
+    for axes in rows:
+        axes.set_xlim(-half, half)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.yaxis.set_label_coords(-0.085, 0.5)
+        if found is not None:
+            ends = found.offset[0] - found.size / 2, found.offset[0] + found.size / 2
+            axes.axvspan(*ends, color=INCLUSION, alpha=0.08, lw=0)
+        if axes is not rows[2]:
+            axes.set_xticklabels([])
+    if found is not None:
+        where: dict[str, Any] = {"ha": "center", "transform": rows[2].get_xaxis_transform()}
+        rows[2].text(found.offset[0], 0.06, "inclusion", fontsize=6, color=INCLUSION, **where)
+    rows[0].set_title(f"{letter}  What the inclusion adds, along y = 0")
+
+
+def _threshold(axes: Axes, half: float, level: float, text: str) -> None:
+    axes.margins(y=0.15)
+    axes.axhline(level, color=FAINT, lw=0.6, ls="--")
+    axes.text(half * 0.99, level, text, fontsize=6, ha="right", va="bottom", color=FAINT)
+
+
+def _along_x(frame: Pictured, values: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Values of the contact surface's nodes, interpolated at (x, 0); NaN beside the surface."""
+    points = np.asarray(frame.surface.points, float)
+    field = LinearTriInterpolator(Triangulation(points[:, 0], points[:, 1], triangles(frame.surface)), values)
+    return np.ma.filled(field(x, np.zeros_like(x)), np.nan)
