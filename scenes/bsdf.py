@@ -17,7 +17,8 @@ from .contact import ContactOptics
 class Table:
     """A `ContactOptics` on the device, looked up bilinearly.
 
-    `transmittance(fraction, cosine)`, `hemispherical(fraction)` and `diffuse_gain(fraction)` take and return `mi.Float`.
+    `transmittance(fraction, cosine)`, `hemispherical(fraction)` and `diffuse_gain(fraction)` take and
+    return `mi.Float`.
     """
 
     def __init__(self, packed: mi.TensorXf) -> None:
@@ -61,8 +62,8 @@ def _cell(x: mi.Float, nodes: int) -> tuple[mi.UInt32, mi.Float]:
 class FrustratedTIR(mi.BSDF):
     """Mirror reflection 1 - T and a diffuse lobe T(cos_i) T(cos_o) K / pi; reciprocal, and black from behind.
 
-    Properties: `table` (from `Table.pack`), `contact_fraction` (a texture, real contact fraction 0..1). The side that the surface
-    normal points to is the guide.
+    Properties: `table` (from `Table.pack`), `contact_fraction` (a texture, real contact fraction 0..1). The
+    side that the surface normal points to is the guide.
     """
 
     def __init__(self, props: mi.Properties) -> None:
@@ -78,7 +79,12 @@ class FrustratedTIR(mi.BSDF):
         callback.put("contact_fraction", self.fraction, mi.ParamFlags.Differentiable)
 
     def sample(
-        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, sample1: mi.Float, sample2: mi.Point2f, active: mi.Bool
+        self,
+        ctx: mi.BSDFContext,
+        si: mi.SurfaceInteraction3f,
+        sample1: mi.Float,
+        sample2: mi.Point2f,
+        active: mi.Bool | bool = True,
     ) -> tuple[mi.BSDFSample3f, mi.Color1f]:
         cos_i = mi.Frame3f.cos_theta(si.wi)
         active = active & (cos_i > 0.0)
@@ -93,7 +99,9 @@ class FrustratedTIR(mi.BSDF):
         spread = mi.warp.square_to_cosine_hemisphere(sample2)
         cos_spread = mi.Frame3f.cos_theta(spread)
         bs.wo = dr.select(is_mirror, mi.reflect(si.wi), spread)
-        bs.pdf = dr.select(is_mirror, p_mirror, (1.0 - p_mirror) * mi.warp.square_to_cosine_hemisphere_pdf(spread))
+        bs.pdf = dr.select(
+            is_mirror, p_mirror, (1.0 - p_mirror) * mi.warp.square_to_cosine_hemisphere_pdf(spread)
+        )
         bs.eta = 1.0
         bs.sampled_type = dr.select(
             is_mirror, mi.UInt32(+mi.BSDFFlags.DeltaReflection), mi.UInt32(+mi.BSDFFlags.DiffuseReflection)
@@ -105,7 +113,7 @@ class FrustratedTIR(mi.BSDF):
         return bs, mi.Color1f(weight) & active
 
     def eval(
-        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool
+        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool | bool = True
     ) -> mi.Color1f:
         cos_i, cos_o = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
         active = active & (cos_i > 0.0) & (cos_o > 0.0)
@@ -115,7 +123,9 @@ class FrustratedTIR(mi.BSDF):
         value = t * gain * self.table.transmittance(a, cos_o, active) * cos_o * dr.inv_pi
         return mi.Color1f(value) & active
 
-    def pdf(self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool) -> mi.Float:
+    def pdf(
+        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool | bool = True
+    ) -> mi.Float:
         cos_i, cos_o = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
         active = active & (cos_i > 0.0) & (cos_o > 0.0)
         if not ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 1):
@@ -127,7 +137,7 @@ class FrustratedTIR(mi.BSDF):
         return dr.select(active, share * cos_o * dr.inv_pi, 0.0)
 
     def eval_pdf(
-        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool
+        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool | bool = True
     ) -> tuple[mi.Color1f, mi.Float]:
         return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
 
