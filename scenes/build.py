@@ -36,9 +36,10 @@ def optics_of(sensor: Sensor) -> ContactOptics:
 def load_scene(sensor: Sensor, optics: ContactOptics) -> mi.Scene:
     """Load the sensor with a flat, unloaded contact surface.
 
-    The contact surface is the mesh with id `contact`; LED number i is the shape with id `led_i`. Media are separated by single
-    faces: guide to air (side walls), guide to glass, glass to air. The glass's rim is held in a black frame and nothing
-    surrounds the sensor (a black housing). Side walls stay flat: their bulge under load, 0.1 mm, is left out.
+    The contact surface is the mesh with id `contact`; LED number i is the shape with id `led_i`. Media are
+    separated by single faces: guide to air (side walls), guide to glass, glass to air. The glass's rim is
+    held in a black frame and nothing surrounds the sensor (a black housing). Side walls stay flat: their
+    bulge under load, 0.1 mm, is left out.
     """
     guide, glass = sensor.guide, sensor.glass
     half, bottom = guide.width_mm / 2, -guide.thickness_mm
@@ -110,7 +111,9 @@ def _contact_mesh(sensor: Sensor, optics: ContactOptics) -> mi.Mesh:
 
 def _fraction(sensor: Sensor, deformed: surface.OpticalSurface) -> np.ndarray:
     skin = sensor.skin
-    fraction = contact_fraction(deformed.pressure_kPa, sensor.effective_modulus_kPa, skin.rms_slope, skin.kappa)
+    fraction = contact_fraction(
+        deformed.pressure_kPa, sensor.effective_modulus_kPa, skin.rms_slope, skin.kappa
+    )
     return surface.with_skirt(fraction)
 
 
@@ -130,7 +133,9 @@ def _face(half: float, z: float, material: dict[str, Any]) -> dict[str, Any]:
     return {"type": "rectangle", "to_world": turn, "bsdf": material}
 
 
-def _wall(half: float, low: float, high: float, outward: tuple[float, float], material: dict[str, Any]) -> dict[str, Any]:
+def _wall(
+    half: float, low: float, high: float, outward: tuple[float, float], material: dict[str, Any]
+) -> dict[str, Any]:
     """A vertical rectangle between two heights whose normal points outward."""
     place = mi.ScalarPoint3f(outward[0] * half, outward[1] * half, 0.5 * (low + high))
     aim = place + mi.ScalarVector3f(*outward, 0.0)
@@ -140,7 +145,9 @@ def _wall(half: float, low: float, high: float, outward: tuple[float, float], ma
 
 def _led(led: Led, half: float) -> dict[str, Any]:
     centre, axis, _ = led_frame(led, half)
-    place = mi.ScalarTransform4f().look_at(origin=centre.tolist(), target=(centre + axis).tolist(), up=[0, 0, 1])
+    place = mi.ScalarTransform4f().look_at(
+        origin=centre.tolist(), target=(centre + axis).tolist(), up=[0, 0, 1]
+    )
     return {
         "type": "disk",
         "to_world": place.scale(led.diameter_mm / 2),
