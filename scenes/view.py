@@ -82,7 +82,8 @@ def faces_reflectance(sensor: Sensor, cosine: Array) -> Array:
     n1, n2 = sensor.guide.refractive_index, sensor.glass.refractive_index
     sine = n1 * np.sqrt(1.0 - np.asarray(cosine) ** 2)
     first, second = _fresnel(n1, n2, sine), _fresnel(n2, 1.0, sine)
-    return np.asarray(first + (1.0 - first) ** 2 * second / (1.0 - first * second))
+    passes = 1.0 - first * second  # 0 where the first face reflects all already
+    return np.asarray(first + (1.0 - first) ** 2 * second / np.where(passes > 0.0, passes, 1.0))
 
 
 def _fresnel(n_in: float, n_out: float, n_sine: Array) -> Array:

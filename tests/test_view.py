@@ -1,0 +1,232 @@
+"""What the camera sees: pixel rays in closed form, against rays that Mitsuba refracts."""
+
+from __future__ import annotations
+
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from sensors import HALF_MM, paper_sensor
+
+from scenes import view
+from scenes.sensor import Glass, Guide, Sensor
+
+SENSORS = {
+    "paper": paper_sensor(),
+    "near and wide": paper_sensor(distance_mm=12.0, field_of_view_mm=24.0),
+    "square pixels, few": paper_sensor(columns=64, rows=48, pixel_um=(10.0, 10.0), field_of_view_mm=20.0),
+}
+
+
+@pytest.fixture(scope="module")
+def mi(variant: str) -> ModuleType:
+    import mitsuba
+
+    return mitsuba
+
+
+def load(sensor: Sensor) -> Any:
+    from scenes import build
+
+    return build.load_scene(sensor, build.optics_of(sensor))
+
+
+def through_the_glass(
+    mi: ModuleType, sensor: Sensor, scene: Any, columns: np.ndarray, rows: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Follow camera rays through Mitsuba's faces: arrival points (n, 3), transmittance, radiance scale."""
+    film = mi.Point2f(mi.Float(columns / sensor.camera.columns), mi.Float(rows / sensor.camera.rows))
+    ray, _ = scene.sensors()[0].sample_ray(
+        mi.Float(0.0), sample1=mi.Float(0.0), sample2=film, sample3=mi.Point2f(0.0)
+    )
+    shapes = {shape.id(): shape for shape in scene.shapes()}
+    reflectances, scale = [], 1.0
+    for name in ("glass_to_air", "guide_to_glass"):
+        si = scene.ray_intersect(ray)
+        assert np.all(np.asarray(si.shape == mi.ShapePtr(shapes[name])))
+        # the number just below 1 always asks for the refracted ray
+        sample, weight = si.bsdf().sample(mi.BSDFContext(), si, mi.Float(0.9999999), mi.Point2f(0.5))
+        reflectances.append(1.0 - np.asarray(sample.pdf).astype(np.float64))
+        scale = scale * np.asarray(weight[0])
+        ray = si.spawn_ray(si.to_world(sample.wo))
+    si = scene.ray_intersect(ray)
+    assert np.all(np.asarray(si.shape == mi.ShapePtr(shapes["contact"])))
+    lower, upper = reflectances
+    return np.array(si.p).T, (1 - lower) * (1 - upper) / (1 - lower * upper), scale
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_pixel_rays_arrive_where_mitsubas_refracted_rays_do(mi: ModuleType, name: str) -> None:
+    sensor = SENSORS[name]
+    rays, camera = view.pixel_rays(sensor), sensor.camera
+    rng = np.random.default_rng(4)
+    corners = np.array(
+        [[0, 0], [0, camera.columns - 1], [camera.rows - 1, 0], [camera.rows - 1, camera.columns - 1]]
+    )
+    inside = np.column_stack([rng.integers(0, camera.rows, 300), rng.integers(0, camera.columns, 300)])
+    row, column = np.concatenate([corners, inside]).T
+    arrived, transmittance, scale = through_the_glass(mi, sensor, load(sensor), column + 0.5, row + 0.5)
+
+    origin, direction = rays.origin_mm[row, column], rays.direction[row, column]
+    np.testing.assert_allclose(np.linalg.norm(direction, axis=1), 1.0, atol=1e-12)
+    expected = origin + direction * (-origin[:, 2:] / direction[:, 2:])
+    error = np.abs(arrived - expected).max()
+    print(f"{name}: arrival points differ by {1e3 * error:.3f} µm at most")
+    assert error < 1e-3
+    np.testing.assert_allclose(rays.transmittance[row, column], transmittance, atol=1e-4)
+    np.testing.assert_allclose(scale, rays.radiance_scale, rtol=1e-5)  # étendue: radiance falls by 1/n²
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_middle_row_is_exactly_as_wide_as_the_field_of_view(mi: ModuleType, name: str) -> None:
+    sensor = SENSORS[name]
+    camera = sensor.camera
+    for column, edge in ((0.0, -0.5), (camera.columns / 2, 0.0), (camera.columns, 0.5)):
+        assert view_x(sensor, column) == pytest.approx(edge * camera.field_of_view_mm, abs=1e-9)
+    inset = 1e-3 * camera.columns  # the very edge may miss a guide as wide as the field
+    columns = np.array([inset, camera.columns / 2, camera.columns - inset])
+    arrived, _, _ = through_the_glass(mi, sensor, load(sensor), columns, np.full(3, camera.rows / 2))
+    np.testing.assert_allclose(arrived[:, 0], [view_x(sensor, c) for c in columns], atol=1e-3)
+    np.testing.assert_allclose(arrived[:, 1], 0.0, atol=1e-5)
+
+
+def view_x(sensor: Sensor, column: float, row: float | None = None, axis: int = 0) -> float:
+    """Where a picture coordinate lands on the undeformed surface, x or y, mm, by Snell's law per slab."""
+    row = sensor.camera.rows / 2 if row is None else row
+    tangential = view.air_directions(sensor, np.array(column), np.array(row))
+    across = float(np.hypot(tangential[0], tangential[1]))
+    if across == 0.0:
+        return 0.0
+    slabs = [
+        (sensor.camera.distance_mm, 1.0),
+        (sensor.glass.thickness_mm, sensor.glass.refractive_index),
+        (sensor.guide.thickness_mm, sensor.guide.refractive_index),
+    ]
+    reach = sum(thickness * np.tan(np.arcsin(across / index)) for thickness, index in slabs)
+    return float(reach * tangential[axis] / across)
+
+
+def test_picture_is_as_seen_from_the_specimen(mi: ModuleType) -> None:
+    """Columns grow with +x, rows with -y."""
+    sensor = SENSORS["paper"]
+    camera = sensor.camera
+    columns = np.array([100.5, 600.5, 384.0, 384.0])
+    rows = np.array([246.0, 246.0, 40.5, 450.5])
+    arrived, _, _ = through_the_glass(mi, sensor, load(sensor), columns, rows)
+    left, right, top, bottom = arrived[:, :2]
+    assert left[0] < -5 and right[0] > 5 and top[1] > 5 and bottom[1] < -5
+    assert abs(left[1]) < 1e-5 and abs(top[0]) < 1e-5
+    rays = view.pixel_rays(sensor)
+    assert rays.direction.shape == rays.origin_mm.shape == (camera.rows, camera.columns, 3)
+    assert np.all(np.diff(rays.direction[0, :, 0]) > 0) and np.all(np.diff(rays.direction[:, 0, 1]) < 0)
+
+
+def test_picture_is_symmetric() -> None:
+    rays = view.pixel_rays(SENSORS["paper"])
+    mirrored = rays.origin_mm[::-1, ::-1] * [-1, -1, 1]
+    np.testing.assert_allclose(mirrored, rays.origin_mm, atol=1e-12)
+    np.testing.assert_allclose(rays.transmittance, rays.transmittance[::-1, ::-1], atol=1e-14)
+
+
+def test_pixels_keep_their_shape() -> None:
+    """One row is 9.8 / 8.4 of one column: everywhere in the tangents, on the surface in the middle."""
+    sensor = SENSORS["paper"]
+    camera = sensor.camera
+    direction = view.air_directions(sensor, *np.meshgrid(np.arange(0, 768, 7.0), np.arange(0, 492, 5.0)))
+    tangent = direction[..., :2] / direction[..., 2:]
+    per_column = np.diff(tangent[..., 0], axis=1) / 7
+    per_row = -np.diff(tangent[..., 1], axis=0) / 5
+    np.testing.assert_allclose(per_column, per_column[0, 0], rtol=1e-10)  # rectilinear
+    np.testing.assert_allclose(per_row, per_column[0, 0] * 9.8 / 8.4, rtol=1e-10)
+
+    x = view_x(sensor, camera.columns / 2 + 1)
+    y = view_x(sensor, camera.columns / 2, camera.rows / 2 - 1, axis=1)
+    assert y / x == pytest.approx(9.8 / 8.4, rel=1e-6)
+
+
+# The faces' reflectance
+
+
+def with_indices(guide: float, glass: float) -> Sensor:
+    paper = SENSORS["paper"]
+    plain: dict[str, Any] = {name: getattr(paper, name) for name in ("leds", "camera", "skin", "tissue")}
+    return Sensor(
+        guide=Guide(width_mm=2 * HALF_MM, thickness_mm=10.0, refractive_index=guide),
+        glass=Glass(refractive_index=glass),
+        effective_modulus_kPa=paper.effective_modulus_kPa,
+        **plain,
+    )
+
+
+def test_normal_incidence_is_the_textbook_stack() -> None:
+    n1, n2 = 1.4336, 1.515
+    r1, r2 = ((n1 - n2) / (n1 + n2)) ** 2, ((n2 - 1) / (n2 + 1)) ** 2
+    expected = (r1 + r2 - 2 * r1 * r2) / (1 - r1 * r2)  # two faces, incoherent (Born & Wolf 1999)
+    ours = view.faces_reflectance(with_indices(n1, n2), np.array(1.0))
+    assert float(ours) == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("glass", [1.40, 1.46, 1.515, 1.9])
+def test_light_beyond_the_critical_angle_of_air_is_all_sent_back(glass: float) -> None:
+    """Whatever the glass: sin(theta) > 1/n of the guide decides."""
+    sensor = with_indices(1.4336, glass)
+    critical = np.sqrt(1 - 1 / 1.4336**2)
+    beyond = np.linspace(0.0, critical - 1e-9, 200)
+    np.testing.assert_allclose(view.faces_reflectance(sensor, beyond), 1.0, atol=1e-12)
+    below = view.faces_reflectance(sensor, np.linspace(critical + 1e-3, 1.0, 200))
+    assert np.all(below < 1.0) and np.all(below > 0.0)
+    assert float(view.faces_reflectance(sensor, np.array(critical + 1e-12))) == pytest.approx(1.0, abs=1e-4)
+
+
+def test_glass_of_the_guides_index_leaves_one_face() -> None:
+    """With no step between guide and glass, what is left is Fresnel's reflectance towards air."""
+    n, cosine = 1.45, np.linspace(0.75, 1.0, 50)
+    cos_air = np.sqrt(1 - n**2 * (1 - cosine**2))
+    r_s = (n * cosine - cos_air) / (n * cosine + cos_air)
+    r_p = (cosine - n * cos_air) / (cosine + n * cos_air)
+    ours = view.faces_reflectance(with_indices(n, n), cosine)
+    np.testing.assert_allclose(ours, 0.5 * (r_s**2 + r_p**2), rtol=1e-12)
+
+
+def test_reflections_inside_the_glass_are_summed_to_the_last() -> None:
+    """Followed one by one, at 30 degrees in the guide."""
+    n1, n2 = 1.4336, 1.9
+    cosine = np.cos(np.radians(30.0))
+    cos2 = np.sqrt(1 - (n1 / n2) ** 2 * (1 - cosine**2))
+    cos3 = np.sqrt(1 - n1**2 * (1 - cosine**2))
+
+    def fresnel(a: float, cos_a: float, b: float, cos_b: float) -> float:
+        s = (a * cos_a - b * cos_b) / (a * cos_a + b * cos_b)
+        p = (b * cos_a - a * cos_b) / (b * cos_a + a * cos_b)
+        return float(0.5 * (s**2 + p**2))
+
+    r1, r2 = fresnel(n1, cosine, n2, cos2), fresnel(n2, cos2, 1.0, cos3)
+    back, inside = r1, 1.0 - r1
+    for _ in range(60):
+        back += inside * r2 * (1 - r1)
+        inside *= r2 * r1
+    assert float(view.faces_reflectance(with_indices(n1, n2), np.array(cosine))) == pytest.approx(
+        back, rel=1e-12
+    )
+
+
+def test_camera_looks_at_the_deformed_surface(mi: ModuleType) -> None:
+    """`gather.look` on a raised, tilted plane: position = where the closed-form ray meets that plane."""
+    from scenes import build, gather
+    from scenes.bsdf import Table
+    from scenes.surface import NODES, OpticalSurface
+
+    sensor = paper_sensor(columns=48, rows=32, field_of_view_mm=20.0)
+    optics = build.optics_of(sensor)
+    scene = build.load_scene(sensor, optics)
+    line = np.linspace(-HALF_MM, HALF_MM, NODES)
+    x, _ = np.meshgrid(line, line)
+    plane = np.stack([0 * x, 0 * x, -0.2 + 0.01 * x], axis=-1)
+    build.put_surface(scene, sensor, OpticalSurface(line, plane, np.ones_like(x)))
+    rays = view.pixel_rays(sensor)
+    sight = gather.look(scene, sensor, Table(Table.pack(optics)), rays)
+    slope = np.array([0.01, 0.0, -1.0])
+    t = -(-0.2 + rays.origin_mm @ slope) / (rays.direction @ slope)
+    expected = (rays.origin_mm + t[..., None] * rays.direction)[..., :2]
+    np.testing.assert_allclose(sight.position_mm, expected, atol=2e-4)
