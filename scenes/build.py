@@ -64,8 +64,12 @@ def put_surface(scene: mi.Scene, sensor: Sensor, deformed: surface.OpticalSurfac
     """Move the scene's contact mesh to the deformed shape and set its real contact fraction, in place."""
     mesh = surface.triangulate(deformed)
     parameters = mi.traverse(scene)
-    if 3 * len(mesh.vertices) != len(parameters["contact.vertex_positions"]):  # Mitsuba would read beyond the end
-        raise ValueError(f"deformed: received {deformed.nodes_mm.size} nodes per side; allowed {surface.NODES}")
+    if 3 * len(mesh.vertices) != len(
+        parameters["contact.vertex_positions"]
+    ):  # Mitsuba would read beyond the end
+        raise ValueError(
+            f"deformed: received {deformed.nodes_mm.size} nodes per side; allowed {surface.NODES}"
+        )
     parameters["contact.vertex_positions"] = _flat(mesh.vertices)
     parameters["contact.vertex_normals"] = _flat(mesh.vertex_normals)
     parameters["contact.vertex_contact_fraction"] = _flat(_fraction(sensor, deformed))

@@ -8,7 +8,7 @@ import numpy as np
 import pyvista as pv
 import trimesh
 from numpy.typing import NDArray
-from scipy.interpolate import CloughTocher2DInterpolator
+from scipy.interpolate import CloughTocher2DInterpolator, RectBivariateSpline
 from scipy.ndimage import map_coordinates
 
 Array = NDArray[np.float64]
@@ -70,13 +70,27 @@ def resample(
         )
 
     line = np.linspace(-half, half, nodes)
-    x, y = np.meshgrid(line, line)
     fields = np.column_stack(
         [surface.point_data[f"displacement{suffix}"], surface.point_data[f"pressure{suffix}"]]
     )
-    # the hull is closed: pull the outermost samples inside by rounding's width, else they would be NaN
-    values = CloughTocher2DInterpolator(points, fields)(x * (1 - 1e-9), y * (1 - 1e-9))
+    values = _interpolate(points, fields, line)
     return OpticalSurface(line, values[..., :3], values[..., 3])
+
+
+def _interpolate(points: Array, fields: Array, line: Array) -> Array:
+    """Fields (n, k) of points (n, 2) on the grid of `line` (m,), (m, m, k); splines if points are a grid."""
+    columns, column = np.unique(np.round(points[:, 0], 9), return_inverse=True)
+    rows, row = np.unique(np.round(points[:, 1], 9), return_inverse=True)
+    if columns.size * rows.size == len(points) and min(columns.size, rows.size) > 3:
+        grid = np.empty((rows.size, columns.size, fields.shape[1]))
+        grid[row, column] = fields
+        layers = [
+            RectBivariateSpline(rows, columns, grid[..., k], s=0)(line, line) for k in range(fields.shape[1])
+        ]
+        return np.stack(layers, axis=-1)
+    x, y = np.meshgrid(line, line)
+    # the hull is closed: pull the outermost samples inside by rounding's width, else they would be NaN
+    return np.asarray(CloughTocher2DInterpolator(points, fields)(x * (1 - 1e-9), y * (1 - 1e-9)))
 
 
 def flat(width_mm: float, pressure_kPa: float, *, nodes: int = NODES) -> OpticalSurface:

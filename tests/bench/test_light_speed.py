@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 
-GOAL = 1000.0
+GOAL = 15_000.0
 """Least ratio of times at equal noise: below it, tracing from the LEDs would not be worth its code."""
 
 NOISE_PERCENT = 1.0
