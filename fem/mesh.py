@@ -39,6 +39,9 @@ class Resolution:
     backing: int  # through each of its other layers
 
 
+# Largest error of tared maximum and total against 145 thousand unknowns, for (size, depth, modulus) =
+# (10, 5, 100), (4, 6, 60), (13, 4, 120): preview 2 %, standard 0.5 %, reference 0.2 %. Shells outside the
+# sphere and cells along its arc matter most.
 QUALITIES = {
     "preview": Resolution(arc=3, core=1, shell=3, above=2, below=1, edge=2, side=2, layer=1, backing=1),
     "standard": Resolution(arc=4, core=1, shell=4, above=3, below=2, edge=3, side=4, layer=3, backing=1),

@@ -6,12 +6,16 @@ import hashlib
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import fem
+from fem.mesh import QUALITIES
+from fem.press import _contact
+from fem.system import solve
 
 LAYERS = (fem.Layer(2, 27), fem.Layer(3, 61), fem.Layer(5, 156))
 PROBE = fem.Probe(25, LAYERS)
@@ -167,6 +171,18 @@ def test_refused_presses(given: dict[str, object], says: str) -> None:
     assert (
         "received" in str(caught.value) and "allowed" in str(caught.value) and "\n" not in str(caught.value)
     )
+
+
+def test_contact_that_opens_is_refused() -> None:
+    """A tie that would have to pull is not an answer: the line says how hard and where."""
+    solution = solve(PROBE, SLAB, BALL, QUALITIES["preview"])
+    reaction = solution.with_inclusion.reaction.copy()
+    reaction[2, 3] *= -1
+    pulled = replace(solution, with_inclusion=replace(solution.with_inclusion, reaction=reaction))
+    where = pulled.place[pulled.system.tip[2, 3]]
+    with pytest.raises(fem.NotModelled, match="contact that opens") as caught:
+        _contact(pulled, (1.0, 1.0), QUALITIES["preview"].edge)
+    assert f"({where[0]:.2f}, {where[1]:.2f}) mm" in str(caught.value)
 
 
 def test_overhanging_probe_is_refused() -> None:
