@@ -14,7 +14,7 @@ import pytest
 
 import fem
 from fem.mesh import QUALITIES
-from fem.press import _contact
+from fem.pressing import _contact
 from fem.system import solve
 
 LAYERS = (fem.Layer(2, 27), fem.Layer(3, 61), fem.Layer(5, 156))
