@@ -4,10 +4,10 @@ import dataclasses
 
 import numpy as np
 import pytest
+from sensors import paper_sensor
 
 from scenes.sensor import Led, Sensor
 from scenes.surface import flat
-from sensors import paper_sensor
 
 RAYS = 2_000_000
 BLOCKS = 10  # per side, of the comparison with thrown rays
@@ -78,7 +78,7 @@ def blocks(values: np.ndarray, width_mm: float) -> np.ndarray:
 
 @pytest.mark.parametrize("coupling", ["air", "embedded"])
 def test_power_per_block_equals_that_of_thrown_rays(variant: str, coupling: str) -> None:
-    """Air: two refractions and Snell's law solved backwards; embedded: none. Off the middle, so that no symmetry helps."""
+    """Air: Snell's law is solved backwards through the face; embedded: not. No symmetry helps."""
     one = alone(coupling, along_mm=3.0, z_mm=-3.5)
     ours, theirs = blocks(irradiance(one), one.guide.width_mm), thrown(one)
     sigma = np.sqrt(theirs * one.leds[0].flux_W / RAYS)  # each ray carries at most flux/RAYS
@@ -99,7 +99,7 @@ def test_small_embedded_led_is_lamberts_law(variant: str) -> None:
     away, up = (half - led.gap_mm) - x, -led.z_mm
     r2 = away**2 + y**2 + up**2
     straight = led.flux_W / np.pi * away * up / r2**2
-    # what comes by the glass lands at angles of its own; only where it leaves (below critical) is it negligible
+    # what comes by the glass is small only where it mostly leaves, below the critical angle
     near = (away > 1.0) & (away < 4.0) & (np.abs(y) < 3.0)
     mirrored_up = 2 * one.guide.thickness_mm - up + 2 * one.glass.thickness_mm
     mirrored = led.flux_W / np.pi * away * mirrored_up / (away**2 + y**2 + mirrored_up**2) ** 2
