@@ -16,7 +16,7 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from skfem import MeshHex, MeshHex2
+from skfem import ElementHex2, MeshHex, MeshHex2
 
 from fem.model import Inclusion, Probe, Slab
 
@@ -39,6 +39,9 @@ class Resolution:
     backing: int  # through each of its other layers
 
 
+# Largest error of tared maximum and total against 145 thousand unknowns, for (size, depth, modulus) =
+# (10, 5, 100), (4, 6, 60), (13, 4, 120): preview 2 %, standard 0.5 %, reference 0.2 %. Shells outside the
+# sphere and cells along its arc matter most.
 QUALITIES = {
     "preview": Resolution(arc=3, core=1, shell=3, above=2, below=1, edge=2, side=2, layer=1, backing=1),
     "standard": Resolution(arc=4, core=1, shell=4, above=3, below=2, edge=3, side=4, layer=3, backing=1),
@@ -238,10 +241,8 @@ def morph_probe(res: Resolution, box: Box, probe: Probe, slab: Slab) -> MeshHex2
 
 def _checked(mesh: MeshHex2, name: str) -> MeshHex2:
     """Refuse a mesh with an element whose Jacobian is not positive at every node of its Q2 lattice."""
-    lattice = MeshHex2().doflocs
-    det = -mesh.mapping().detDF(
-        lattice
-    )  # scikit-fem's reference hexahedron is point-mirrored: upright ones have -1
+    # scikit-fem's reference hexahedron is point-mirrored: upright ones have a negative determinant
+    det = -mesh.mapping().detDF(ElementHex2.doflocs.T)
     if det.min() <= 0:
         cell = int(det.min(axis=1).argmin())
         x, y, z = mesh.p[:, mesh.t[:, cell]].mean(axis=1)

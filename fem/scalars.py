@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-import pyvista as pv
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import pyvista as pv
 
 Floats = NDArray[np.float64]
 

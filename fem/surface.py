@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pyvista as pv
 from numpy.typing import NDArray
-from skfem import MeshHex2
+from skfem import ElementHex2, MeshHex2
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -100,7 +100,7 @@ def _quads(nine: Ints) -> Ints:
 
 def cut_faces(logical: MeshHex2) -> tuple[Ints, Ints]:
     """Nine-node faces on y = 0: nodes (m, 9) and the element of each (m,)."""
-    lattice = np.round(2 * MeshHex2().doflocs).astype(int)
+    lattice = np.round(2 * ElementHex2.doflocs.T).astype(int)
     nodes = logical.dofs.element_dofs
     on_cut = np.abs(logical.doflocs[1]) < 1e-9
     found: list[tuple[Ints, Ints]] = []

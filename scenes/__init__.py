@@ -1,7 +1,8 @@
 """Optics: from a pressed contact surface to the radiance at the camera.
 
-`gap_transmittance` is the law, `Renderer` the transport of light, `expose` the camera. What draws in VTK or Mitsuba is imported
-with the first `Renderer`, not here, so that reading a design or asking for help stays fast.
+`gap_transmittance` is the law, `Renderer` the transport of light, `expose` the camera. What draws in VTK or
+Mitsuba is imported with the first `Renderer`, not here, so that reading a design or asking for help stays
+fast.
 """
 
 from __future__ import annotations

@@ -36,9 +36,10 @@ def optics_of(sensor: Sensor) -> ContactOptics:
 def load_scene(sensor: Sensor, optics: ContactOptics) -> mi.Scene:
     """Load the sensor with a flat, unloaded contact surface.
 
-    The contact surface is the mesh with id `contact`; LED number i is the shape with id `led_i`. Media are separated by single
-    faces: guide to air (side walls), guide to glass, glass to air. The glass's rim is held in a black frame and nothing
-    surrounds the sensor (a black housing). Side walls stay flat: their bulge under load, 0.1 mm, is left out.
+    The contact surface is the mesh with id `contact`; LED number i is the shape with id `led_i`. Media are
+    separated by single faces: guide to air (side walls), guide to glass, glass to air. The glass's rim is
+    held in a black frame and nothing surrounds the sensor (a black housing). Side walls stay flat: their
+    bulge under load, 0.1 mm, is left out.
     """
     guide, glass = sensor.guide, sensor.glass
     half, bottom = guide.width_mm / 2, -guide.thickness_mm
@@ -63,8 +64,12 @@ def put_surface(scene: mi.Scene, sensor: Sensor, deformed: surface.OpticalSurfac
     """Move the scene's contact mesh to the deformed shape and set its real contact fraction, in place."""
     mesh = surface.triangulate(deformed)
     parameters = mi.traverse(scene)
-    if 3 * len(mesh.vertices) != len(parameters["contact.vertex_positions"]):  # Mitsuba would read beyond the end
-        raise ValueError(f"deformed: received {deformed.nodes_mm.size} nodes per side; allowed {surface.NODES}")
+    if 3 * len(mesh.vertices) != len(
+        parameters["contact.vertex_positions"]
+    ):  # Mitsuba would read beyond the end
+        raise ValueError(
+            f"deformed: received {deformed.nodes_mm.size} nodes per side; allowed {surface.NODES}"
+        )
     parameters["contact.vertex_positions"] = _flat(mesh.vertices)
     parameters["contact.vertex_normals"] = _flat(mesh.vertex_normals)
     parameters["contact.vertex_contact_fraction"] = _flat(_fraction(sensor, deformed))
@@ -112,7 +117,9 @@ def _contact_mesh(sensor: Sensor, optics: ContactOptics) -> mi.Mesh:
 
 def _fraction(sensor: Sensor, deformed: surface.OpticalSurface) -> np.ndarray:
     skin = sensor.skin
-    fraction = contact_fraction(deformed.pressure_kPa, sensor.effective_modulus_kPa, skin.rms_slope, skin.kappa)
+    fraction = contact_fraction(
+        deformed.pressure_kPa, sensor.effective_modulus_kPa, skin.rms_slope, skin.kappa
+    )
     return surface.with_skirt(fraction)
 
 
@@ -132,7 +139,9 @@ def _face(half: float, z: float, material: dict[str, Any]) -> dict[str, Any]:
     return {"type": "rectangle", "to_world": turn, "bsdf": material}
 
 
-def _wall(half: float, low: float, high: float, outward: tuple[float, float], material: dict[str, Any]) -> dict[str, Any]:
+def _wall(
+    half: float, low: float, high: float, outward: tuple[float, float], material: dict[str, Any]
+) -> dict[str, Any]:
     """A vertical rectangle between two heights whose normal points outward."""
     place = mi.ScalarPoint3f(outward[0] * half, outward[1] * half, 0.5 * (low + high))
     aim = place + mi.ScalarVector3f(*outward, 0.0)
@@ -142,7 +151,9 @@ def _wall(half: float, low: float, high: float, outward: tuple[float, float], ma
 
 def _led(led: Led, half: float) -> dict[str, Any]:
     centre, axis, _ = led_frame(led, half)
-    place = mi.ScalarTransform4f().look_at(origin=centre.tolist(), target=(centre + axis).tolist(), up=[0, 0, 1])
+    place = mi.ScalarTransform4f().look_at(
+        origin=centre.tolist(), target=(centre + axis).tolist(), up=[0, 0, 1]
+    )
     return {
         "type": "disk",
         "to_world": place.scale(led.diameter_mm / 2),

@@ -1,7 +1,8 @@
-"""LED light that reaches the contact surface straight, or mirrored once in the glass's lower face: gathered, not traced.
+"""LED light that comes to the contact surface straight or by the glass's lower face: gathered, not traced.
 
-These two families of paths carry most of the light and all of its sharp edges (the rims of escape and acceptance cones), so
-they are integrated without noise and without smoothing. All other paths are left to `trace`.
+These two families of paths carry most of the light and all of its sharp edges (the rims of escape and
+acceptance cones), so they are integrated without noise and without smoothing. All other paths are left to
+`trace`.
 
 Import only after a variant is set (`scenes.backend.use`).
 """
@@ -30,9 +31,10 @@ _GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 
 @dataclass(frozen=True)
 class _Path:
-    """Unknown slopes (y, z) per unit of the LED's axis where a ray leaves the disc, and all that follows from them.
+    """A ray from an LED's disc, and how its landing point moves with its two slopes (y, z per unit of axis).
 
-    Snell's law keeps the tangential components p of (index x direction) through every flat face, so one ray is two numbers.
+    Snell's law keeps the tangential components p of (index x direction) through every flat face, so one ray
+    is two numbers.
     """
 
     p_y: mi.Float
@@ -46,17 +48,20 @@ class _Path:
 
 
 def direct(sensor: Sensor, basis: AngularBasis, deformed: OpticalSurface) -> Array:
-    """Weighted irradiance of the two families, (n_led, count, 2 CELLS, 2 CELLS), W/mm², as `trace.smooth` returns the rest.
+    """Weighted irradiance of the two families, (n_led, count, 2 CELLS, 2 CELLS), W/mm².
 
-    From a Lambertian disc of flux F and area A in a medium of index m, the element dA sends F/(pi A m²) dA dp_y dp_z, so the
-    irradiance at a target is that times |d(p_y, p_z)/d(x, y)|, the ray's two unknowns being found by Newton's method. Height and
-    slope of the deformed surface at the target are kept; what the other LEDs' discs shade is left out.
+    On the grid on which `trace.smooth` returns the rest.
+
+    From a Lambertian disc of flux F and area A in a medium of index m, the element dA sends F/(pi A m²) dA
+    dp_y dp_z, so the irradiance at a target is that times |d(p_y, p_z)/d(x, y)|, the ray's two unknowns being
+    found by Newton's method. Height and slope of the deformed surface at the target are kept; what the other
+    LEDs' discs shade is left out.
     """
     n_led, count = len(sensor.leds), basis.count
     half = sensor.guide.width_mm / 2
     middles = (np.arange(CELLS) + 0.5) / CELLS * 2 * half - half
     height = heights(deformed, middles)
-    slope_y, slope_x = np.gradient(height, middles, middles)
+    slope_y, slope_x = (np.gradient(height, middles, axis=axis) for axis in (0, 1))
     x, y = np.meshgrid(middles, middles)
     target = [_float(values) for values in (x, y, height, slope_x, slope_y)]
 
@@ -92,7 +97,7 @@ def direct(sensor: Sensor, basis: AngularBasis, deformed: OpticalSurface) -> Arr
 
 @dataclass(frozen=True)
 class _Source:
-    """The LED of each lane: centre (along axis from the face, along the side, z), medium, étendue's flux, radius."""
+    """The LED of each lane, in its own frame: axis into the guide, along its side, up."""
 
     axis_x: mi.Float
     axis_y: mi.Float
@@ -109,12 +114,24 @@ class _Source:
         half, n = sensor.guide.width_mm / 2, sensor.guide.refractive_index
         rows = []
         for lamp in sensor.leds:
-            _, axis, tangent = led_frame(lamp, half)
+            _, axis, _ = led_frame(lamp, half)
             in_air = lamp.coupling == "air"
             medium = 1.0 if in_air else n
             gap, inset = (lamp.gap_mm, 0.0) if in_air else (0.0, lamp.gap_mm)
             density = lamp.flux_W / (np.pi * medium**2)
-            rows.append([axis[0], axis[1], lamp.along_mm, lamp.z_mm, gap, inset, medium, lamp.diameter_mm / 2, density])
+            rows.append(
+                [
+                    axis[0],
+                    axis[1],
+                    lamp.along_mm,
+                    lamp.z_mm,
+                    gap,
+                    inset,
+                    medium,
+                    lamp.diameter_mm / 2,
+                    density,
+                ]
+            )
         return _Source(*(dr.gather(mi.Float, _float(column), led) for column in np.array(rows).T))
 
 
@@ -212,14 +229,16 @@ def _follow(
 
 
 def _fresnel(n_in: mi.Float, n_out: mi.Float, tangential2: mi.Float) -> mi.Float:
-    """Unpolarised Fresnel reflectance for squared tangential index; 1 beyond the critical angle (key born1999)."""
+    """Unpolarised Fresnel reflectance at a squared tangential index, total beyond critical (key born1999)."""
     total = tangential2 >= dr.square(n_out)
     a = dr.sqrt(dr.maximum(dr.square(n_in) - tangential2, 0.0))
     b = dr.sqrt(dr.maximum(dr.square(n_out) - tangential2, 0.0))
     s = (a - b) / dr.maximum(a + b, 1e-12)
-    p = (dr.square(n_out) * a - dr.square(n_in) * b) / dr.maximum(dr.square(n_out) * a + dr.square(n_in) * b, 1e-12)
+    p = (dr.square(n_out) * a - dr.square(n_in) * b) / dr.maximum(
+        dr.square(n_out) * a + dr.square(n_in) * b, 1e-12
+    )
     return dr.select(total, 1.0, 0.5 * (dr.square(s) + dr.square(p)))
 
 
-def _float(values: Array) -> mi.Float:
+def _float(values: np.ndarray) -> mi.Float:
     return mi.Float(np.ascontiguousarray(values, dtype=np.float32).ravel())

@@ -30,8 +30,8 @@ class Sight:
     position_mm : (rows, columns, 2)
         Point of the deformed surface that each pixel sees directly.
     points : list of (x, y, fraction, gain)
-        For each sight, on the device: position in units of the guide's width (0..1), real contact fraction, and radiance at
-        the camera per transmitted irradiance, 1/sr.
+        For each sight, on the device: position in units of the guide's width (0..1), real contact fraction,
+        and radiance at the camera per transmitted irradiance, 1/sr.
     lamps : (n_led, rows, columns)
         Radiance at the camera, W mm⁻² sr⁻¹, of LEDs that stand in the way (embedded ones).
     """
@@ -61,8 +61,16 @@ def look(scene: mi.Scene, sensor: Sensor, table: Table, rays: PixelRays) -> Sigh
         fraction = dr.select(seen, contact.eval_attribute_1("vertex_contact_fraction", si, seen), 0.0)
         transmitted = table.transmittance(fraction, cosine, seen)
         emitted = transmitted * table.diffuse_gain(fraction, seen) * dr.inv_pi
-        points.append((si.p.x / guide.width_mm + 0.5, si.p.y / guide.width_mm + 0.5, fraction, dr.select(seen, gain * emitted, 0.0)))
-        # mirrored in the contact surface, down, mirrored in the lower faces, up again; the deformation's slope left out
+        points.append(
+            (
+                si.p.x / guide.width_mm + 0.5,
+                si.p.y / guide.width_mm + 0.5,
+                fraction,
+                dr.select(seen, gain * emitted, 0.0),
+            )
+        )
+        # mirrored in the contact surface, down, mirrored in the lower faces, up again; the deformation's
+        # slope left out
         gain = dr.select(seen, gain * (1.0 - transmitted) * mirrored, 0.0)
         run = (si.p.z + guide.thickness_mm) / direction.z
         start = mi.Point3f(si.p.x + run * direction.x, si.p.y + run * direction.y, -guide.thickness_mm + 1e-3)
@@ -93,7 +101,9 @@ def picture(sight: Sight, basis: AngularBasis, irradiance: NDArray[np.float64]) 
     """
     n_led, count = irradiance.shape[:2]
     maps = np.moveaxis(irradiance.reshape(n_led * count, *irradiance.shape[2:]), 0, -1)
-    texture = mi.Texture2f(mi.TensorXf(np.ascontiguousarray(maps, dtype=np.float32)), wrap_mode=dr.WrapMode.Clamp)
+    texture = mi.Texture2f(
+        mi.TensorXf(np.ascontiguousarray(maps, dtype=np.float32)), wrap_mode=dr.WrapMode.Clamp
+    )
     rows = mi.Float(np.ascontiguousarray(basis.rows, dtype=np.float32).ravel())
     last = basis.rows.shape[0] - 1
     total = [mi.Float(0.0) for _ in range(n_led)]

@@ -13,7 +13,8 @@ from .view import tangent_scale
 
 
 class Pinhole(mi.Sensor):
-    """A pinhole at `origin` looking up (+z); the film spans the tangents ±`reach` (x, y), columns with +x, rows with -y.
+    """A pinhole at `origin` looking up (+z); the film spans the tangents ±`reach` (x, y), columns with +x,
+    rows with -y.
 
     Mitsuba's own `perspective` knows square pixels only. Rays carry weight 1: the film holds radiance.
     """
@@ -25,7 +26,12 @@ class Pinhole(mi.Sensor):
         self.m_reach_x, self.m_reach_y = reach.x, reach.y
 
     def sample_ray(
-        self, time: mi.Float, sample1: mi.Float, sample2: mi.Point2f, sample3: mi.Point2f, active: mi.Bool = True
+        self,
+        time: mi.Float,
+        sample1: mi.Float,
+        sample2: mi.Point2f,
+        sample3: mi.Point2f,
+        active: mi.Bool = True,
     ) -> tuple[mi.Ray3f, mi.Color1f]:
         tangent_x = (2.0 * sample2.x - 1.0) * self.m_reach_x
         tangent_y = (1.0 - 2.0 * sample2.y) * self.m_reach_y
@@ -34,7 +40,12 @@ class Pinhole(mi.Sensor):
         return ray, mi.Color1f(1.0)
 
     def sample_ray_differential(
-        self, time: mi.Float, sample1: mi.Float, sample2: mi.Point2f, sample3: mi.Point2f, active: mi.Bool = True
+        self,
+        time: mi.Float,
+        sample1: mi.Float,
+        sample2: mi.Point2f,
+        sample3: mi.Point2f,
+        active: mi.Bool = True,
     ) -> tuple[mi.RayDifferential3f, mi.Color1f]:
         ray, weight = self.sample_ray(time, sample1=sample1, sample2=sample2, sample3=sample3, active=active)
         return mi.RayDifferential3f(ray), weight

@@ -47,8 +47,8 @@ def path_trace(
     Returns
     -------
     (mean, error)
-        Radiance (rows, columns) in W m⁻² sr⁻¹ and the standard error of each pixel's mean. Sums run in a fixed order: the
-        bytes do not depend on the number of threads.
+        Radiance (rows, columns) in W m⁻² sr⁻¹ and the standard error of each pixel's mean. Sums run in a
+        fixed order: the bytes do not depend on the number of threads.
     """
     camera = sensor.camera
     top, end_row, left, end_column = crop or (0, camera.rows, 0, camera.columns)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from . import backend, surface, view
 from .sensor import Sensor
@@ -40,8 +41,8 @@ class Rendering:
     pressure, displacement_z : (rows, columns)
         Contact pressure, kPa, and displacement, mm (+z into the specimen), at that point.
     noise_percent : float
-        Standard error of the radiance of all LEDs together from the Monte Carlo method, in per cent of it, median over the
-        pixels; measured from independent halves (traced) or from the spread of the samples (reference).
+        Standard error of the radiance of all LEDs together from Monte Carlo, in per cent of it, median over
+        the pixels; measured from independent halves (traced) or from the spread of the samples (reference).
     seconds : float
         Wall-clock time.
     """
@@ -55,7 +56,7 @@ class Rendering:
 
 
 class Renderer:
-    """A sensor's scene, built once; each `render` moves its contact surface in place and traces light again."""
+    """A sensor's scene, built once; each `render` moves its contact surface in place."""
 
     def __init__(self, sensor: Sensor, device: str = "auto") -> None:
         """Load the scene on `device` ("auto", "cpu" or "cuda"; see `backend.use`)."""
@@ -67,9 +68,10 @@ class Renderer:
 
         self.sensor = sensor
         self.rays = view.pixel_rays(sensor)
-        optics = build.optics_of(sensor)
+        with threadpool_limits(1):  # linear algebra on several threads sums in another order
+            optics = build.optics_of(sensor)
+            self.basis = angular_basis(optics)
         self.table = Table(Table.pack(optics))
-        self.basis = angular_basis(optics)
         self.scene = build.load_scene(sensor, optics)
 
     def render(
@@ -91,7 +93,8 @@ class Renderer:
         field
             "pressure", or "pressure_0" for the press without inclusion (and `displacement_0` with it).
         quality
-            "preview" and "standard" trace light from the LEDs; "reference" is stock `path` through the real scene: hours.
+            "preview" and "standard" trace light from the LEDs; "reference" is stock `path` through the real
+            scene: hours.
         seed
             Seed of the light. The same seed gives the same bytes, whatever the number of threads.
         samples
@@ -113,10 +116,17 @@ class Renderer:
         else:
             radiance, noise = self._traced(shape, sight, samples or PATHS_PER_LED[quality], seed, tell)
         pressure, displacement_z = surface.at(shape, sight.position_mm)
-        return Rendering(radiance, sight.position_mm, pressure, displacement_z, noise, time.perf_counter() - start)
+        return Rendering(
+            radiance, sight.position_mm, pressure, displacement_z, noise, time.perf_counter() - start
+        )
 
     def _traced(
-        self, shape: surface.OpticalSurface, sight: Sight, samples: int, seed: int, tell: Callable[[float], None]
+        self,
+        shape: surface.OpticalSurface,
+        sight: Sight,
+        samples: int,
+        seed: int,
+        tell: Callable[[float], None],
     ) -> tuple[NDArray[np.float32], float]:
         from . import direct, gather, trace
 
@@ -129,13 +139,16 @@ class Renderer:
         radiance = 0.5 * (halves[0] + halves[1])
         both = [layers.sum(axis=0, dtype=np.float64) for layers in halves]
         spread, mean = 0.5 * np.abs(both[0] - both[1]), 0.5 * (both[0] + both[1])
-        # half the difference of the halves is one draw of the mean's error, |error| of a normal has median 0.6745 sigma
+        # half the difference of the halves is one draw of the mean's error, |error| of a normal has median
+        # 0.6745 sigma
         return radiance, float(100.0 * np.median(spread / np.maximum(mean, 1e-30)) / 0.6745)
 
-    def _reference(self, samples: int, seed: int, tell: Callable[[float], None]) -> tuple[NDArray[np.float32], float]:
+    def _reference(
+        self, samples: int, seed: int, tell: Callable[[float], None]
+    ) -> tuple[NDArray[np.float32], float]:
         from . import build, reference
 
-        layers, variance = [], 0.0
+        layers, variance = [], np.zeros(self.rays.transmittance.shape)
         count = len(self.sensor.leds)
         for led in range(count):
             build.light_only(self.scene, self.sensor, led)

@@ -1,4 +1,4 @@
-"""The deformed contact surface as light needs it: a fine regular triangle mesh with pressure on its vertices."""
+"""The deformed contact surface as light needs it: a fine, regular triangle mesh with pressure."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pyvista as pv
 import trimesh
 from numpy.typing import NDArray
-from scipy.interpolate import CloughTocher2DInterpolator
+from scipy.interpolate import CloughTocher2DInterpolator, RectBivariateSpline
 from scipy.ndimage import map_coordinates
 
 Array = NDArray[np.float64]
@@ -36,13 +36,16 @@ class OpticalSurface:
     pressure_kPa: Array
 
 
-def resample(surface: pv.PolyData, width_mm: float, *, suffix: str = "", nodes: int = NODES) -> OpticalSurface:
-    """Interpolate the finite elements' surface onto the optical grid, C1-smooth so that its normals are continuous.
+def resample(
+    surface: pv.PolyData, width_mm: float, *, suffix: str = "", nodes: int = NODES
+) -> OpticalSurface:
+    """Interpolate the finite elements' surface onto the optical grid, C1-smooth, so normals are continuous.
 
     Parameters
     ----------
     surface
-        Points (n, 3) mm undeformed, covering the guide's face; point arrays `displacement` (n, 3) mm and `pressure` (n,) kPa.
+        Points (n, 3) mm undeformed, covering the guide's face; point arrays `displacement` (n, 3) mm and
+        `pressure` (n,) kPa.
     width_mm
         Side of the guide's face, mm.
     suffix
@@ -55,19 +58,39 @@ def resample(surface: pv.PolyData, width_mm: float, *, suffix: str = "", nodes: 
     """
     for name in (f"displacement{suffix}", f"pressure{suffix}"):
         if name not in surface.point_data:
-            raise ValueError(f"surface: received point arrays {sorted(surface.point_data)}; allowed: one named '{name}'")
+            raise ValueError(
+                f"surface: received point arrays {sorted(surface.point_data)}; allowed: one named '{name}'"
+            )
     half = width_mm / 2
     points = np.asarray(surface.points, dtype=np.float64)[:, :2]
     reach = np.abs(points).max(axis=0)
     if np.any(np.abs(reach - half) > 1e-6 * width_mm):
-        raise ValueError(f"surface: received points up to {reach.tolist()} mm from the middle; allowed {half} mm in x and y")
+        raise ValueError(
+            f"surface: received points up to {reach.tolist()} mm from the middle; allowed {half} mm in x, y"
+        )
 
     line = np.linspace(-half, half, nodes)
-    x, y = np.meshgrid(line, line)
-    fields = np.column_stack([surface.point_data[f"displacement{suffix}"], surface.point_data[f"pressure{suffix}"]])
-    # the hull is closed: pull the outermost samples inside by rounding's width, else they would be NaN
-    values = CloughTocher2DInterpolator(points, fields)(x * (1 - 1e-9), y * (1 - 1e-9))
+    fields = np.column_stack(
+        [surface.point_data[f"displacement{suffix}"], surface.point_data[f"pressure{suffix}"]]
+    )
+    values = _interpolate(points, fields, line)
     return OpticalSurface(line, values[..., :3], values[..., 3])
+
+
+def _interpolate(points: Array, fields: Array, line: Array) -> Array:
+    """Fields (n, k) of points (n, 2) on the grid of `line` (m,), (m, m, k); splines if points are a grid."""
+    columns, column = np.unique(np.round(points[:, 0], 9), return_inverse=True)
+    rows, row = np.unique(np.round(points[:, 1], 9), return_inverse=True)
+    if columns.size * rows.size == len(points) and min(columns.size, rows.size) > 3:
+        grid = np.empty((rows.size, columns.size, fields.shape[1]))
+        grid[row, column] = fields
+        layers = [
+            RectBivariateSpline(rows, columns, grid[..., k], s=0)(line, line) for k in range(fields.shape[1])
+        ]
+        return np.stack(layers, axis=-1)
+    x, y = np.meshgrid(line, line)
+    # the hull is closed: pull the outermost samples inside by rounding's width, else they would be NaN
+    return np.asarray(CloughTocher2DInterpolator(points, fields)(x * (1 - 1e-9), y * (1 - 1e-9)))
 
 
 def flat(width_mm: float, pressure_kPa: float, *, nodes: int = NODES) -> OpticalSurface:
@@ -77,16 +100,18 @@ def flat(width_mm: float, pressure_kPa: float, *, nodes: int = NODES) -> Optical
 
 
 def triangulate(surface: OpticalSurface) -> trimesh.Trimesh:
-    """Deformed triangles, (n + 2)² vertices in row-major [iy, ix] order, normals towards the guide (-z).
+    """Deformed triangles, (n + 2)² vertices in row-major [iy, ix] order, normals towards the guide.
 
-    The scene's side walls are flat, so what bulges beyond them (0.1 mm) is pressed back, and an outermost ring closes the gap
-    where the surface recedes.
+    The scene's side walls are flat, so what bulges beyond them (0.1 mm) is pressed back, and an outermost
+    ring closes the gap where the surface recedes.
     """
     lines = surface.nodes_mm
     x, y = np.meshgrid(lines, lines)
     position = np.stack([x, y, np.zeros_like(x)], axis=-1) + surface.displacement_mm
     position = np.pad(position, ((1, 1), (1, 1), (0, 0)), mode="edge")
-    limit = lines[-1] + _LIP_MM - 1e-5 * np.arange(lines.size + 2)[::-1]  # rising, so that no triangle degenerates
+    limit = (
+        lines[-1] + _LIP_MM - 1e-5 * np.arange(lines.size + 2)[::-1]
+    )  # rising, so that no triangle degenerates
     for axis, shape in enumerate(((1, -1), (-1, 1))):
         outward = limit.reshape(shape)
         inward = -np.flip(outward)
@@ -108,10 +133,13 @@ def _faces(n: int) -> NDArray[np.int64]:
     return np.concatenate([lower, upper])
 
 
-def at(surface: OpticalSurface, position_mm: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Pressure, kPa, and displacement along z, mm, at deformed positions (..., 2) mm; both of shape (...).
+def at(
+    surface: OpticalSurface, position_mm: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Pressure, kPa, and displacement along z, mm, at deformed positions (..., 2) mm; shape (...).
 
-    The undeformed point of each position is found by fixed-point iteration, which contracts by the strain (a few per cent).
+    The undeformed point of each position is found by fixed-point iteration, which contracts by the strain (a
+    few per cent).
     """
     line = surface.nodes_mm
     step = line[1] - line[0]
@@ -126,10 +154,13 @@ def at(surface: OpticalSurface, position_mm: NDArray[np.float32]) -> tuple[NDArr
         shift = np.stack([look_up(surface.displacement_mm[..., i], undeformed) for i in (0, 1)], axis=-1)
         undeformed = target - shift
     pressure = look_up(surface.pressure_kPa, undeformed)
-    return pressure.astype(np.float32), look_up(surface.displacement_mm[..., 2], undeformed).astype(np.float32)
+    return pressure.astype(np.float32), look_up(surface.displacement_mm[..., 2], undeformed).astype(
+        np.float32
+    )
 
 
 def heights(surface: OpticalSurface, line_mm: Array) -> Array:
-    """Height z, mm, of the deformed surface over the grid of deformed coordinates `line_mm` (m,), shape (m, m) at [iy, ix]."""
+    """Height z, mm, of the deformed surface at [iy, ix] of the grid of deformed coordinates `line_mm`
+    (m,)."""
     x, y = np.meshgrid(line_mm, line_mm)
     return at(surface, np.stack([x, y], axis=-1).astype(np.float32))[1].astype(np.float64)

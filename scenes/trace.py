@@ -1,7 +1,7 @@
 """Light traced from the LEDs: how much of it, and at what angles, arrives where on the contact surface.
 
-Two families of paths are left out because `direct` gathers them without noise: straight from the LED to the surface, and mirrored
-once in the glass's lower face.
+Two families of paths are left out because `direct` gathers them without noise: straight from the LED to the
+surface, and mirrored once in the glass's lower face.
 
 Import only after a variant is set (`scenes.backend.use`).
 """
@@ -26,13 +26,14 @@ Array = NDArray[np.float64]
 
 CELLS = 100  # of the irradiance grid, per side
 _SMOOTHING_CELLS = 2.5  # standard deviation of the smoothing kernel
-_FIXED_POINT = float(2**20)  # deposits are summed as integers: the sum does not depend on the order of threads
+# Deposits are summed as integers: the sum does not depend on the order of threads
+_FIXED_POINT = float(2**20)
 _MAX_BOUNCES = 256
 # Legs of the two families of paths that `direct` gathers, and any other
 _IN_AIR, _IN_GUIDE, _DOWN, _IN_GLASS_UP, _BACK_UP, _OTHER = range(6)
 _SURE_BOUNCES = 12  # before Russian roulette
-# Fractional parts of powers of 1/phi_4, phi_4 the root of x^5 = x + 1, times 2^32: an additive recurrence that fills the
-# unit 4-cube evenly (Roberts 2018; key roberts2018)
+# Fractional parts of powers of 1/phi_4, phi_4 the root of x^5 = x + 1, times 2^32: an additive recurrence
+# that fills the unit 4-cube evenly (Roberts 2018; key roberts2018)
 _RECURRENCE = tuple(int((1.1673039782614187 ** -(k + 1) % 1.0) * 2**32) | 1 for k in range(4))
 
 
@@ -40,8 +41,8 @@ _RECURRENCE = tuple(int((1.1673039782614187 ** -(k + 1) % 1.0) * 2**32) | 1 for 
 class AngularBasis:
     """Separable form of the contact's transmittance, T(A_r, cos) = sum_k rows[:, k](A_r) columns[k](cos).
 
-    Light arrives spread over angles, so T cannot be taken out of the integral over them; with this form the integral is
-    `count` irradiances, smooth over the surface, whatever the pressure does from pixel to pixel.
+    Light arrives spread over angles, so T cannot be taken out of the integral over them; with this form the
+    integral is `count` irradiances, smooth over the surface, whatever the pressure does from pixel to pixel.
     """
 
     rows: Array  # (n_fraction, count)
@@ -79,18 +80,20 @@ def trace(scene: mi.Scene, sensor: Sensor, basis: AngularBasis, samples: int, se
     Returns
     -------
     (n_led, count, CELLS, CELLS)
-        ∫ columns[k](cos) L cos dω, W/mm², raw (not smoothed) on cells [iy, ix] of the deformed surface over the guide's face.
+        ∫ columns[k](cos) L cos dω, W/mm², raw (not smoothed) on cells [iy, ix] of the deformed surface over
+        the guide's face.
     """
     n_led, count, width = len(sensor.leds), basis.count, sensor.guide.width_mm
     index = dr.arange(mi.UInt32, n_led * samples)
     number = index // mi.UInt32(dr.opaque(mi.UInt32, samples))
     ray = _emit(sensor, number, index - number * dr.opaque(mi.UInt32, samples), seed)
-    random = mi.PCG32(size=n_led * samples, initstate=dr.opaque(mi.UInt64, seed), initseq=mi.UInt64(index) + 1)
+    random = mi.PCG32(
+        size=n_led * samples, initstate=dr.opaque(mi.UInt64, seed), initseq=mi.UInt64(index) + 1
+    )
     weights = mi.Float(np.ascontiguousarray(basis.columns.T, dtype=np.float32).ravel())
     landed = dr.zeros(mi.Int64, n_led * count * CELLS * CELLS)
     named = {shape.id(): mi.ShapePtr(shape) for shape in scene.shapes()}
-    contact, upper, lower = named["contact"], named["guide_to_glass"], named["glass_to_air"]
-    walls = [pointer for name, pointer in named.items() if name.startswith("wall_")]
+    contact = named["contact"]
     context = mi.BSDFContext(mi.TransportMode.Importance)
     n_cos = basis.columns.shape[1]
 
@@ -120,15 +123,7 @@ def trace(scene: mi.Scene, sensor: Sensor, basis: AngularBasis, samples: int, se
         scattered, weight = si.bsdf(ray).sample(context, si, sample1, sample2, alive)
         throughput = throughput * dr.select(alive, weight[0], 0.0)
         passed = mi.has_flag(scattered.sampled_type, mi.BSDFFlags.DeltaTransmission)
-        on_wall = mi.Bool(False)
-        for wall in walls:
-            on_wall |= si.shape == wall
-        enters = (leg == _IN_AIR) & on_wall & passed
-        goes_down = (leg == _IN_GUIDE) & (si.shape == upper) & passed
-        turns = (leg == _DOWN) & (si.shape == lower) & ~passed
-        comes_up = (leg == _IN_GLASS_UP) & (si.shape == upper) & passed
-        leg = dr.select(enters, _IN_GUIDE, dr.select(goes_down, _DOWN, dr.select(turns, _IN_GLASS_UP,
-              dr.select(comes_up, _BACK_UP, mi.UInt32(_OTHER)))))
+        leg = _next_leg(leg, si.shape, passed, named)
         survive = dr.select(bounce < _SURE_BOUNCES, 1.0, dr.minimum(throughput, 0.95))
         alive &= (throughput > 0.0) & (random.next_float32() < survive) & (bounce < _MAX_BOUNCES)
         throughput = dr.select(alive, throughput / survive, 0.0)
@@ -144,19 +139,18 @@ def trace(scene: mi.Scene, sensor: Sensor, basis: AngularBasis, samples: int, se
 def smooth(irradiance: Array, factor: int = 4) -> Array:
     """Smoothed irradiance on a grid `factor` times finer, over the last two axes, mirrored at the edges.
 
-    The kernel 2 G - G * G has no second moment, so the curvature of the irradiance survives; cubic splines interpolate.
+    The kernel 2 G - G * G has no second moment, so the curvature of the irradiance survives; cubic splines
+    interpolate.
     """
     return _along_both(_smoothing_matrix(irradiance.shape[-1], factor, smoothed=True), irradiance)
 
 
 def refine(irradiance: Array, factor: int) -> Array:
-    """Values on a grid `factor` times finer over the last two axes, by cubic splines between the cells' middles."""
+    """Values on a grid `factor` times finer over the last two axes, by cubic splines."""
     return _along_both(_smoothing_matrix(irradiance.shape[-1], factor, smoothed=False), irradiance)
 
 
-def weigh(
-    weights: mi.Float, count: int, n_cos: int, cosine: mi.Float, active: mi.Bool
-) -> list[mi.Float]:
+def weigh(weights: mi.Float, count: int, n_cos: int, cosine: mi.Float, active: mi.Bool) -> list[mi.Float]:
     """The basis' columns at a cosine; `weights` is their (n_cos, count) table, flattened."""
     at = dr.clip(cosine, 0.0, 1.0) * (n_cos - 1)
     node = dr.minimum(mi.UInt32(at), n_cos - 2)
@@ -173,7 +167,7 @@ def _along_both(step: Array, irradiance: Array) -> Array:
 
 @lru_cache(maxsize=4)
 def _smoothing_matrix(cells: int, factor: int, *, smoothed: bool) -> Array:
-    """(factor * cells, cells): smooth along one axis if asked to, then interpolate at the finer cells' middles."""
+    """(factor * cells, cells): smooth along one axis if asked to, then refine by cubic splines."""
     reach = int(np.ceil(6 * _SMOOTHING_CELLS))
     gauss = np.exp(-0.5 * (np.arange(-reach, reach + 1) / _SMOOTHING_CELLS) ** 2)
     gauss /= gauss.sum()
@@ -186,12 +180,14 @@ def _smoothing_matrix(cells: int, factor: int, *, smoothed: bool) -> Array:
 
 
 def _emit(sensor: Sensor, number: mi.UInt32, index: mi.UInt32, seed: int) -> mi.Ray3f:
-    """Rays from the LEDs' discs, evenly over area and cosine-weighted over angle, by an additive recurrence."""
+    """Rays from the LEDs' discs, even over area, cosine-weighted over angle, by an additive recurrence."""
     half = sensor.guide.width_mm / 2
     frames = np.array([np.concatenate(led_frame(led, half)) for led in sensor.leds])
     radii = np.array([led.diameter_mm / 2 for led in sensor.leds])
     columns = [mi.Float(column.astype(np.float32)) for column in (*frames.T, radii)]
-    centre, axis, tangent = (mi.Vector3f(*(dr.gather(mi.Float, columns[3 * i + j], number) for j in range(3))) for i in range(3))
+    centre, axis, tangent = (
+        mi.Vector3f(*(dr.gather(mi.Float, columns[3 * i + j], number) for j in range(3))) for i in range(3)
+    )
     radius = dr.gather(mi.Float, columns[9], number)
 
     start = np.random.Generator(np.random.Philox(seed)).integers(0, 2**32, size=4, dtype=np.uint64)
@@ -202,6 +198,26 @@ def _emit(sensor: Sensor, number: mi.UInt32, index: mi.UInt32, seed: int) -> mi.
     origin = centre + radius * (on_disc.x * frame.s + on_disc.y * frame.t)
     away = frame.to_world(direction)
     return mi.Ray3f(mi.Point3f(origin + 1e-4 * away), away)
+
+
+def _next_leg(
+    leg: mi.UInt32, shape: mi.ShapePtr, passed: mi.Bool, named: dict[str, mi.ShapePtr]
+) -> mi.UInt32:
+    """The leg after an event at `shape`, `passed` if light went through it."""
+    on_wall = mi.Bool(False)
+    for name, pointer in named.items():
+        if name.startswith("wall_"):
+            on_wall |= shape == pointer
+    upper, lower = shape == named["guide_to_glass"], shape == named["glass_to_air"]
+    following = mi.UInt32(_OTHER)
+    for before, event, after in (
+        (_IN_AIR, on_wall & passed, _IN_GUIDE),
+        (_IN_GUIDE, upper & passed, _DOWN),
+        (_DOWN, lower & ~passed, _IN_GLASS_UP),
+        (_IN_GLASS_UP, upper & passed, _BACK_UP),
+    ):
+        following = dr.select((leg == before) & event, mi.UInt32(after), following)
+    return following
 
 
 def _fraction(integer: mi.UInt32) -> mi.Float:

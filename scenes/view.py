@@ -1,4 +1,4 @@
-"""What the camera's pinhole sees: pixel rays refracted through the two flat faces of the glass, in closed form."""
+"""What the camera's pinhole sees: pixel rays refracted through the glass's two flat faces, in closed form."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ class PixelRays:
     origin_mm, direction : (rows, columns, 3)
         Point on the face between guide and glass, and unit direction.
     transmittance : (rows, columns)
-        Fresnel transmittance of both faces together, unpolarised, with the reflections inside the glass summed.
+        Fresnel transmittance of both faces together, unpolarised, with the reflections inside the glass
+        summed.
     radiance_scale : float
         Radiance in air over radiance in the guide of an unattenuated ray, 1/n² (conservation of étendue).
     """
@@ -36,8 +37,8 @@ class PixelRays:
 def tangent_scale(sensor: Sensor) -> float:
     """Tangent of the ray angle in air per mm on the camera's sensor.
 
-    Chosen so that the picture is exactly `field_of_view_mm` wide where its middle row meets the contact surface, refraction
-    included; the optics are otherwise rectilinear.
+    Chosen so that the picture is exactly `field_of_view_mm` wide where its middle row meets the contact
+    surface, refraction included; the optics are otherwise rectilinear.
     """
     edge = sensor.camera.field_of_view_mm / 2
 
@@ -49,7 +50,8 @@ def tangent_scale(sensor: Sensor) -> float:
 
 
 def air_directions(sensor: Sensor, column: Array, row: Array) -> Array:
-    """Unit directions (..., 3) in air, from the pinhole up, of picture coordinates (0 to columns, 0 to rows; x.5 are middles)."""
+    """Unit directions (..., 3) in air, from the pinhole up, of picture coordinates (x.5 are pixels'
+    middles)."""
     camera, scale = sensor.camera, tangent_scale(sensor)
     tangent_x = (np.asarray(column) - camera.columns / 2) * camera.pixel_um[0] * 1e-3 * scale
     tangent_y = -(np.asarray(row) - camera.rows / 2) * camera.pixel_um[1] * 1e-3 * scale
@@ -67,11 +69,13 @@ def pixel_rays(sensor: Sensor) -> PixelRays:
     offset = in_air[..., :2] / in_air[..., 2:] * camera.distance_mm
     offset = offset + in_glass[..., :2] / in_glass[..., 2:] * glass.thickness_mm
     origin = np.concatenate([offset, np.full((*offset.shape[:2], 1), -guide.thickness_mm)], axis=-1)
-    return PixelRays(origin, in_guide, 1.0 - faces_reflectance(sensor, in_guide[..., 2]), 1.0 / guide.refractive_index**2)
+    transmittance = 1.0 - faces_reflectance(sensor, in_guide[..., 2])
+    return PixelRays(origin, in_guide, transmittance, 1.0 / guide.refractive_index**2)
 
 
 def faces_reflectance(sensor: Sensor, cosine: Array) -> Array:
-    """Share of light that the faces guide/glass and glass/air send back into the guide, same shape as `cosine` (in the guide).
+    """Share of light that the faces guide/glass and glass/air send back, same shape as `cosine` (in the
+    guide).
 
     Incoherent sum over the reflections inside the glass: R = R1 + (1 - R1)² R2 / (1 - R1 R2).
     """
@@ -83,7 +87,7 @@ def faces_reflectance(sensor: Sensor, cosine: Array) -> Array:
 
 
 def _fresnel(n_in: float, n_out: float, n_sine: Array) -> Array:
-    """Unpolarised Fresnel reflectance for tangential index n sin(theta) (Born & Wolf 1999, sec. 1.5.2; key born1999)."""
+    """Unpolarised Fresnel reflectance at tangential index n sin(theta) (Born & Wolf 1999; key born1999)."""
     a = np.sqrt(np.maximum(n_in**2 - n_sine**2, 0.0))
     b = np.sqrt(np.maximum(n_out**2 - n_sine**2, 0.0))
     s = (a - b) / np.maximum(a + b, 1e-300)

@@ -114,7 +114,7 @@ def _add_run_flags(parser: Parser, out: str | None = None) -> None:
         type=choice(*QUALITIES),
         default="standard",
         metavar="Q",
-        help=", ".join(QUALITIES) + " (default standard)",
+        help=", ".join(QUALITIES) + " (default standard; reference traces paths from the camera: hours)",
     )
     parser.add_argument(
         "--seed", type=whole, default=0, metavar="N", help="of all random numbers (default 0)"

@@ -73,18 +73,19 @@ def scale_bar(axes: Axes, x: float, y: float, length_mm: float, colour: str) -> 
 
 def draw_pressure(axes: Axes, frame: Pictured, letter: str) -> None:
     """Contact pressure over the whole contact surface, kPa; the singular rim runs off the colours."""
-    mesh, camera = frame.surface, frame.design.camera
-    points = np.asarray(mesh.points, float)
-    pressure = np.asarray(mesh.point_data["pressure"], float)
-    half = frame.design.waveguide.width_mm / 2
-    inner = pressure[np.abs(points[:, :2]).max(axis=1) < INNER * half]
-    top = float(inner.max() if inner.size else pressure.max())
-    drawn = axes.tripcolor(
-        points[:, 0],
-        points[:, 1],
-        triangles(mesh),
+    from scenes.surface import resample  # not before it is needed: it imports a mesh library
+
+    camera, width_mm = frame.design.camera, frame.design.waveguide.width_mm
+    half = width_mm / 2
+    smooth = resample(frame.surface, width_mm)
+    pressure = smooth.pressure_kPa
+    inside = np.abs(smooth.nodes_mm) < INNER * half
+    top = float(pressure[np.ix_(inside, inside)].max())
+    drawn = axes.imshow(
         pressure,
-        shading="gouraud",
+        origin="lower",
+        extent=(-half, half, -half, half),
+        interpolation="bilinear",
         cmap="viridis",
         vmin=float(pressure.min()),
         vmax=top,

@@ -143,7 +143,6 @@ def _facts(axes: Axes, frame: Pictured, letter: str) -> None:
         ("lowest contact pressure", f"{fem['min_pressure_kPa']:.3f} kPa"),
         ("unknowns of the mechanics", _number(fem["dof"])),
         ("noise of the computed light", f"{tsis['noise_percent']:.2f} %"),
-        ("time: mechanics, light", f"{fem['seconds']:.1f} s, {tsis['seconds']:.1f} s"),
     )
     for i, (name, value) in enumerate(facts):
         axes.text(0, 0.73 - _LINE * i, name)
