@@ -119,12 +119,12 @@ def test_light_of_leds_adds_up(mi: ModuleType, scene: Any) -> None:
         layers = []
         for led in range(4):
             build.light_only(scene, SMALL, led)
-            layers.append(path_trace(scene, SMALL, 1024, 10 + led, crop=crop))
+            layers.append(path_trace(scene, SMALL, 2048, 10 + led, crop=crop))
         build.light_only(scene, SMALL, -1)
         dark, _ = path_trace(scene, SMALL, 16, 0, crop=crop)
     finally:
         build.light_only(scene, SMALL, None)
-    together, error = path_trace(scene, SMALL, 1024, 20, crop=crop)
+    together, error = path_trace(scene, SMALL, 2048, 20, crop=crop)
     assert np.all(dark == 0.0)
     total = sum(float(mean.mean()) for mean, _ in layers)
     spread = np.sqrt(sum(float(np.sum(e**2)) for _, e in (*layers, (together, error)))) / together.size
