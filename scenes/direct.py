@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .build import led_frame
+from .irradiance import AngularBasis, refine, weigh
 from .sensor import Sensor
 from .surface import OpticalSurface, heights
-from .trace import AngularBasis, refine, weigh
 
 Array = NDArray[np.float64]
 
@@ -50,7 +50,7 @@ class _Path:
 def direct(sensor: Sensor, basis: AngularBasis, deformed: OpticalSurface) -> Array:
     """Weighted irradiance of the two families, (n_led, count, 2 CELLS, 2 CELLS), W/mm².
 
-    On the grid on which `trace.smooth` returns the rest.
+    On the grid on which `irradiance.smooth` returns the rest.
 
     From a Lambertian disc of flux F and area A in a medium of index m, the element dA sends F/(pi A m²) dA
     dp_y dp_z, so the irradiance at a target is that times |d(p_y, p_z)/d(x, y)|, the ray's two unknowns being

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from .bsdf import Table
 from .build import radiance
+from .irradiance import AngularBasis, land
 from .sensor import Sensor
-from .trace import AngularBasis
 from .view import PixelRays, faces_reflectance
 
 _SIGHTS = 2  # the surface seen directly, and mirrored once in the lower faces; a third sight adds 1e-5
@@ -99,23 +99,11 @@ def picture(sight: Sight, basis: AngularBasis, irradiance: NDArray[np.float64]) 
 
     `irradiance` (n_led, count, m, m), W/mm², smoothed, on cells [iy, ix] of the guide's face.
     """
-    n_led, count = irradiance.shape[:2]
-    maps = np.moveaxis(irradiance.reshape(n_led * count, *irradiance.shape[2:]), 0, -1)
-    texture = mi.Texture2f(
-        mi.TensorXf(np.ascontiguousarray(maps, dtype=np.float32)), wrap_mode=dr.WrapMode.Clamp
-    )
-    rows = mi.Float(np.ascontiguousarray(basis.rows, dtype=np.float32).ravel())
-    last = basis.rows.shape[0] - 1
+    n_led = irradiance.shape[0]
     total = [mi.Float(0.0) for _ in range(n_led)]
     for x, y, fraction, gain in sight.points:
-        node = dr.minimum(mi.UInt32(fraction * last), last - 1)
-        share = fraction * last - mi.Float(node)
-        landed = texture.eval(mi.Point2f(x, y))
-        for k in range(count):
-            low, high = (dr.gather(mi.Float, rows, (node + i) * count + k) for i in (0, 1))
-            weight = gain * dr.lerp(low, high, share)
-            for led in range(n_led):
-                total[led] += weight * landed[led * count + k]
+        landed = land(basis, irradiance, x, y, fraction)
+        total = [sum_ + gain * part for sum_, part in zip(total, landed, strict=True)]
     dr.eval(total)
     shape = (n_led, *sight.position_mm.shape[:2])
     layers = np.stack([np.asarray(layer) for layer in total]).reshape(shape)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 Quality = Literal["preview", "standard", "reference"]
 
-PATHS_PER_LED = {"preview": 2**17, "standard": 2**20}
+PATHS_PER_LED = {"preview": 2**17, "standard": 2**21}
 """Light paths that the traced qualities spend on each LED; "reference" has samples per pixel instead."""
 
 REFERENCE_SAMPLES = 4096
@@ -64,7 +64,7 @@ class Renderer:
         # only now: Mitsuba's classes bind to the variant that is active when they are defined
         from . import build
         from .bsdf import Table
-        from .trace import angular_basis
+        from .irradiance import angular_basis
 
         self.sensor = sensor
         self.rays = view.pixel_rays(sensor)
@@ -128,13 +128,15 @@ class Renderer:
         seed: int,
         tell: Callable[[float], None],
     ) -> tuple[NDArray[np.float32], float]:
-        from . import direct, gather, trace
+        from . import direct, gather, irradiance, trace
 
         straight = direct.direct(self.sensor, self.basis, shape)
         halves = []
         for half in (0, 1):
-            landed = trace.trace(self.scene, self.sensor, self.basis, max(samples // 2, 1), 2 * seed + half)
-            halves.append(gather.picture(sight, self.basis, straight + trace.smooth(landed)))
+            landed = trace.trace(
+                self.scene, self.sensor, self.table, self.basis, straight, samples // 2, 2 * seed + half
+            )
+            halves.append(gather.picture(sight, self.basis, straight + irradiance.smooth(landed)))
             tell(0.5 * (half + 1))
         radiance = 0.5 * (halves[0] + halves[1])
         both = [layers.sum(axis=0, dtype=np.float64) for layers in halves]

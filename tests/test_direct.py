@@ -22,7 +22,7 @@ def alone(coupling: str, **changes: float) -> Sensor:
 def irradiance(one: Sensor) -> np.ndarray:
     """(400, 400) W/mm² on the flat, unloaded contact surface, every angle counting alike."""
     from scenes.direct import direct
-    from scenes.trace import AngularBasis
+    from scenes.irradiance import AngularBasis
 
     everything = AngularBasis(np.ones((2, 1)), np.ones((1, 2)))
     return direct(one, everything, flat(one.guide.width_mm, 0.0))[0, 0]

@@ -185,15 +185,19 @@ def test_path_gives_the_same_bytes_on_one_thread_and_on_two(mi: ModuleType, scen
 def test_traced_light_is_the_same_bytes_on_one_thread_and_on_two(
     mi: ModuleType, scene: Any, threads: Any
 ) -> None:
-    from scenes import build, trace
+    from scenes import build, direct, irradiance, surface, trace
+    from scenes.bsdf import Table
 
-    basis = trace.angular_basis(build.optics_of(SMALL))
+    table = Table(Table.pack(build.optics_of(SMALL)))
+    basis = irradiance.angular_basis(build.optics_of(SMALL))
+    shape = surface.resample(bump(), SMALL.guide.width_mm)
     landed = []
     for count in (1, 2, 2):
         threads(count)
-        landed.append(trace.trace(scene, SMALL, basis, 2**15, 5))
+        straight = direct.direct(SMALL, basis, shape)
+        landed.append(trace.trace(scene, SMALL, table, basis, straight, 2**15, 5))
     assert landed[0].tobytes() == landed[1].tobytes() == landed[2].tobytes()
-    other = trace.trace(scene, SMALL, basis, 2**15, 6)
+    other = trace.trace(scene, SMALL, table, basis, straight, 2**15, 6)
     assert np.mean(other != landed[0]) > 0.1  # most cells are dark in both
 
 

@@ -1,0 +1,117 @@
+"""Irradiance on the contact surface, spread over angles: how it is weighed, smoothed and looked up.
+
+Import only after a variant is set (`scenes.backend.use`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import correlate1d
+
+from .contact import ContactOptics
+
+Array = NDArray[np.float64]
+
+_SMOOTHING_CELLS = 2.5  # standard deviation of the smoothing kernel
+
+
+@dataclass(frozen=True)
+class AngularBasis:
+    """Separable form of the contact's transmittance, T(A_r, cos) = sum_k rows[:, k](A_r) columns[k](cos).
+
+    Light arrives spread over angles, so T cannot be taken out of the integral over them; with this form the
+    integral is `count` irradiances, smooth over the surface, whatever the pressure does from pixel to pixel.
+    """
+
+    rows: Array  # (n_fraction, count)
+    columns: Array  # (count, n_cos)
+
+    @property
+    def count(self) -> int:
+        return self.columns.shape[0]
+
+
+def angular_basis(optics: ContactOptics, tolerance: float = 5e-5) -> AngularBasis:
+    """Truncated singular value decomposition of the table, largest error at most `tolerance`."""
+    u, s, v = np.linalg.svd(optics.transmittance, full_matrices=False)
+    for count in range(1, s.size + 1):
+        rows, columns = u[:, :count] * s[:count], v[:count]
+        if np.abs(rows @ columns - optics.transmittance).max() <= tolerance:
+            break
+    return AngularBasis(rows, columns)
+
+
+def weigh(weights: mi.Float, count: int, n_cos: int, cosine: mi.Float, active: mi.Bool) -> list[mi.Float]:
+    """The basis' columns at a cosine; `weights` is their (n_cos, count) table, flattened."""
+    at = dr.clip(cosine, 0.0, 1.0) * (n_cos - 1)
+    node = dr.minimum(mi.UInt32(at), n_cos - 2)
+    share = at - mi.Float(node)
+    low = [dr.gather(mi.Float, weights, node * count + k, active) for k in range(count)]
+    high = [dr.gather(mi.Float, weights, (node + 1) * count + k, active) for k in range(count)]
+    return [dr.lerp(a, b, share) for a, b in zip(low, high, strict=True)]
+
+
+def land(
+    basis: AngularBasis, irradiance: Array, x: mi.Float, y: mi.Float, fraction: mi.Float
+) -> list[mi.Float]:
+    """Irradiance that enters the tissue, W/mm², from each LED at points with a real contact fraction.
+
+    `irradiance` (n_led, count, m, m) on cells [iy, ix] of the guide's face; x and y in units of its width.
+    """
+    n_led, count = irradiance.shape[:2]
+    maps = np.moveaxis(irradiance.reshape(n_led * count, *irradiance.shape[2:]), 0, -1)
+    texture = mi.Texture2f(
+        mi.TensorXf(np.ascontiguousarray(maps, dtype=np.float32)), wrap_mode=dr.WrapMode.Clamp
+    )
+    rows = mi.Float(np.ascontiguousarray(basis.rows, dtype=np.float32).ravel())
+    last = basis.rows.shape[0] - 1
+    node = dr.minimum(mi.UInt32(fraction * last), last - 1)
+    share = fraction * last - mi.Float(node)
+    values = texture.eval(mi.Point2f(x, y))
+    total = [mi.Float(0.0) for _ in range(n_led)]
+    for k in range(count):
+        low, high = (dr.gather(mi.Float, rows, (node + i) * count + k) for i in (0, 1))
+        weight = dr.lerp(low, high, share)
+        for led in range(n_led):
+            total[led] += weight * values[led * count + k]
+    return total
+
+
+def smooth(irradiance: Array, factor: int = 4) -> Array:
+    """Smoothed irradiance on a grid `factor` times finer, over the last two axes, mirrored at the edges.
+
+    The kernel 2 G - G * G has no second moment, so the curvature of the irradiance survives; cubic splines
+    interpolate.
+    """
+    return _along_both(_smoothing_matrix(irradiance.shape[-1], factor, smoothed=True), irradiance)
+
+
+def refine(irradiance: Array, factor: int) -> Array:
+    """Values on a grid `factor` times finer over the last two axes, by cubic splines."""
+    return _along_both(_smoothing_matrix(irradiance.shape[-1], factor, smoothed=False), irradiance)
+
+
+def _along_both(step: Array, irradiance: Array) -> Array:
+    # einsum, not matmul: its order of summation does not depend on the number of threads
+    return np.einsum("yi,...ij,xj->...yx", step, irradiance, step, optimize=["einsum_path", (0, 1), (0, 1)])
+
+
+@lru_cache(maxsize=4)
+def _smoothing_matrix(cells: int, factor: int, *, smoothed: bool) -> Array:
+    """(factor * cells, cells): smooth along one axis if asked to, then refine by cubic splines."""
+    reach = int(np.ceil(6 * _SMOOTHING_CELLS))
+    gauss = np.exp(-0.5 * (np.arange(-reach, reach + 1) / _SMOOTHING_CELLS) ** 2)
+    gauss /= gauss.sum()
+    twice = np.convolve(gauss, gauss)
+    kernel = -twice
+    kernel[reach:-reach] += 2.0 * gauss
+    cell_values = correlate1d(np.eye(cells), kernel, axis=0, mode="reflect") if smoothed else np.eye(cells)
+    middles, finer = np.arange(cells) + 0.5, (np.arange(factor * cells) + 0.5) / factor
+    return np.asarray(CubicSpline(middles, cell_values)(finer))
