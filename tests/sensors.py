@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any, Literal
 
 import numpy as np
 import pyvista as pv
 
+from scenes.contact import ContactOptics, contact_optics
 from scenes.sensor import Camera, Glass, Guide, Led, Sensor, Side, Skin, Tissue
 
 HALF_MM = 12.5
+ALBEDO = 0.68
 
 
 def paper_sensor(coupling: Literal["air", "embedded"] = "air", **camera: Any) -> Sensor:
@@ -55,3 +58,18 @@ def bump() -> pv.PolyData:
         lambda x, y: (0.05 * x / HALF_MM, 0.05 * y / HALF_MM, -0.05 - 0.02 * rise(x, y)),
         cells=100,
     )
+
+
+@cache
+def contact_table(albedo: float = ALBEDO) -> ContactOptics:
+    return contact_optics(1.4336, 1.0, 1.40, albedo, 10.0, 550.0)
+
+
+def contact_bsdf(fraction: float, albedo: float = ALBEDO) -> dict[str, Any]:
+    from scenes.bsdf import Table
+
+    return {
+        "type": "frustrated_tir",
+        "table": Table.pack(contact_table(albedo)),
+        "contact_fraction": {"type": "uniform", "value": fraction},
+    }

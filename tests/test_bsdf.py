@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.stats import qmc
+from sensors import ALBEDO, contact_bsdf, contact_table
 
-from scenes.contact import ContactOptics, contact_optics
+from scenes.contact import contact_optics
 
 FRACTIONS = [0.0, 0.003, 0.13, 0.5, 1.0]
 # Grazing, where this tissue admits nothing; beyond and at the critical angle of an air gap; normal.
 COSINES = [0.05, 0.4, 0.72, 1.0]
-ALBEDO = 0.68
 
 
 @pytest.fixture(scope="module")
@@ -29,25 +29,10 @@ def mi(variant: str) -> ModuleType:
 
 
 @cache
-def optics(albedo: float = ALBEDO) -> ContactOptics:
-    return contact_optics(1.4336, 1.0, 1.40, albedo, 10.0, 550.0)
-
-
-@cache
 def _material(fraction: float, albedo: float) -> Any:
     import mitsuba
 
-    return mitsuba.load_dict(describe(fraction, albedo))
-
-
-def describe(fraction: float, albedo: float = ALBEDO) -> dict[str, Any]:
-    from scenes.bsdf import Table
-
-    return {
-        "type": "frustrated_tir",
-        "table": Table.pack(optics(albedo)),
-        "contact_fraction": {"type": "uniform", "value": fraction},
-    }
+    return mitsuba.load_dict(contact_bsdf(fraction, albedo))
 
 
 def material(fraction: float, albedo: float = ALBEDO) -> Any:
@@ -56,7 +41,7 @@ def material(fraction: float, albedo: float = ALBEDO) -> Any:
 
 def look_up(fraction: float, cosine: np.ndarray, albedo: float = ALBEDO) -> tuple[np.ndarray, float, float]:
     """T, its hemispherical mean and K by numpy's own interpolation."""
-    table = optics(albedo)
+    table = contact_table(albedo)
     nodes = np.linspace(0.0, 1.0, table.transmittance.shape[0])
     row = np.array([np.interp(fraction, nodes, column) for column in table.transmittance.T])
     transmittance = np.interp(cosine, np.linspace(0.0, 1.0, row.size), row)
@@ -110,7 +95,7 @@ def draw(mi: ModuleType, plugin: Any, cosine: float, count: int = 2**17, compone
 def test_table_on_the_device_equals_numpys_interpolation(mi: ModuleType) -> None:
     from scenes.bsdf import Table
 
-    table = Table(Table.pack(optics()))
+    table = Table(Table.pack(contact_table()))
     rng = np.random.default_rng(5)
     edge = [(0.0, 0.0), (0.0, 1.0), (1.0, 0.0), (1.0, 1.0), (0.5, 0.25)]  # corners and nodes
     places = np.concatenate([rng.random((300, 2)), edge]).astype(np.float32)
@@ -132,7 +117,7 @@ def test_table_on_the_device_equals_numpys_interpolation(mi: ModuleType) -> None
 def test_lookup_outside_the_table_is_clamped(mi: ModuleType) -> None:
     from scenes.bsdf import Table
 
-    table = Table(Table.pack(optics()))
+    table = Table(Table.pack(contact_table()))
     beyond = table.transmittance(mi.Float([-0.1, 1.1]), mi.Float([1.0 + 1e-6, -1e-6]))
     inside = table.transmittance(mi.Float([0.0, 1.0]), mi.Float([1.0, 0.0]))
     np.testing.assert_allclose(np.asarray(beyond), np.asarray(inside))
@@ -176,7 +161,7 @@ def test_energy_balances_between_the_tables_nodes(mi: ModuleType) -> None:
     fraction, cosine = rng.random((side, side)).astype(np.float32), rng.random(count).astype(np.float32)
     bitmap = mi.Bitmap(fraction[..., None])
     texture = {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": "nearest"}
-    table = Table.pack(optics(1.0))
+    table = Table.pack(contact_table(1.0))
     plugin = mi.load_dict({"type": "frustrated_tir", "table": table, "contact_fraction": texture})
 
     wo, solid_angle = hemisphere(mi, per, 1)
@@ -187,63 +172,6 @@ def test_energy_balances_between_the_tables_nodes(mi: ModuleType) -> None:
     lobe = np.asarray(plugin.eval(mi.BSDFContext(), si, wo, mi.Bool(True))[0]).reshape(count, per)
     mirror = 1.0 - np.asarray(Table(table).transmittance(mi.Float(fraction.ravel()), mi.Float(cosine)))
     np.testing.assert_allclose(mirror + lobe @ solid_angle, 1.0, atol=1e-3)
-
-
-# White furnace
-
-
-def furnace(mi: ModuleType, fraction: float, albedo: float, lid_of_light: bool) -> dict[str, Any]:
-    """A contact surface as floor, four walls of radiance 1, and a lid: one more, or the floor's twin."""
-    t = mi.ScalarTransform4f
-    black = {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.0}}
-    light = {"bsdf": black, "emitter": {"type": "area", "radiance": {"type": "uniform", "value": 1.0}}}
-    contact = {"bsdf": describe(fraction, albedo)}
-    lid = t().translate([0, 0, 1]).rotate([1, 0, 0], 180)
-    scene: dict[str, Any] = {"type": "scene"}
-    scene["floor"] = {"type": "rectangle", **contact}  # looks up, +z
-    scene["lid"] = {"type": "rectangle", "to_world": lid, **(light if lid_of_light else contact)}
-    for k, (x, y) in enumerate([(1, 0), (-1, 0), (0, 1), (0, -1)]):
-        place = t().look_at(origin=[x, y, 0.5], target=[0, 0, 0.5], up=[0, 0, 1]).scale([1, 0.5, 1])
-        scene[f"wall_{k}"] = {"type": "rectangle", "to_world": place, **light}
-    return scene
-
-
-def furnace_radiance(mi: ModuleType, description: dict[str, Any], count: int = 2**22) -> tuple[float, float]:
-    """Mean radiance that the floor sends up to many points of view in the chamber, and its standard error."""
-    scene = mi.load_dict(description)
-    integrator = mi.load_dict({"type": "path", "max_depth": 200, "rr_depth": 100})
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(3, count)
-    spot, tilt = sampler.next_2d(), sampler.next_2d()
-    up = mi.warp.square_to_cosine_hemisphere(tilt)
-    foot = mi.Point3f(1.98 * (spot.x - 0.5), 1.98 * (spot.y - 0.5), 0.0)
-    ray = mi.RayDifferential3f(mi.Ray3f(foot + 1e-3 * up, -up))
-    radiance = np.asarray(integrator.sample(scene, sampler, ray)[0][0])
-    mean, spread = radiance.mean(dtype=np.float64), radiance.std(dtype=np.float64)
-    return float(mean), float(spread / np.sqrt(count))
-
-
-@pytest.mark.parametrize(
-    ("fraction", "lid_of_light"),
-    [(0.0, True), (0.003, True), (0.13, True), (1.0, True), (0.5, False), (1.0, False)],
-)
-def test_white_furnace_stays_white(mi: ModuleType, fraction: float, lid_of_light: bool) -> None:
-    """No absorption anywhere and radiance 1 from all walls: everything in the chamber has radiance 1.
-
-    Twin surfaces, which see each other many times, need good contact: without it, light leaves the tissue
-    in a narrow cone, the weights of cosine-distributed samples multiply from bounce to bounce, and the noise
-    has no end.
-    """
-    mean, error = furnace_radiance(mi, furnace(mi, fraction, 1.0, lid_of_light))
-    print(f"A_r {fraction}, lid of light {lid_of_light}: radiance {mean:.5f} ± {error:.5f}")
-    assert error < 5e-4
-    assert mean == pytest.approx(1.0, abs=1e-3)
-
-
-def test_furnace_with_a_black_tissue_does_not(mi: ModuleType) -> None:
-    """The furnace can fail: with an absorbing tissue the floor is darker than its surroundings."""
-    mean, _ = furnace_radiance(mi, furnace(mi, 0.5, 0.0, True), 2**16)
-    assert mean < 0.8
 
 
 # Sampling
@@ -295,7 +223,7 @@ def test_component_alone_passes_mitsubas_own_adapter(
     ctx = mi.BSDFContext()
     ctx.component = 1
     adapter = chi2.BSDFAdapter(
-        "frustrated_tir", {**describe(0.13), "table": dense}, wi=[0.6, 0, 0.8], ctx=ctx
+        "frustrated_tir", {**contact_bsdf(0.13), "table": dense}, wi=[0.6, 0, 0.8], ctx=ctx
     )
     test = chi2.ChiSquareTest(chi2.SphericalDomain(), *adapter, sample_dim=3, sample_count=300_000, res=31)
     assert test.run(significance_level=0.01, test_count=1), test.messages
@@ -422,7 +350,7 @@ def test_grazing_light_gives_no_nan(mi: ModuleType) -> None:
 
 
 def test_contact_is_changed_in_place(mi: ModuleType) -> None:
-    plugin = mi.load_dict(describe(0.0))
+    plugin = mi.load_dict(contact_bsdf(0.0))
     parameters = mi.traverse(plugin)
     parameters["contact_fraction.value"] = 0.5
     parameters.update()
