@@ -133,7 +133,7 @@ def _walk(
         mirrored = mi.has_flag(scattered.sampled_type, mi.BSDFFlags.DeltaReflection)
         share = dr.select(gathered, dr.select(mirrored, scattered.pdf, 0.0), 1.0)
         throughput = throughput * dr.select(alive, weight[0] * share, 0.0)
-        passed = mi.has_flag(scattered.sampled_type, mi.BSDFFlags.DeltaTransmission)
+        passed = cosine * mi.Frame3f.cos_theta(scattered.wo) < 0.0
         leg = _next_leg(leg, si.shape, passed, named)
         survive = dr.select(bounce < _SURE_BOUNCES, 1.0, dr.minimum(throughput, 0.95))
         alive &= (throughput > 0.0) & (random.next_float32() < survive) & (bounce < _MAX_BOUNCES)
