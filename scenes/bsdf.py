@@ -27,6 +27,10 @@ class Table:
         self._t = mi.Float(columns[:, :-2].ravel())
         self._mean = mi.Float(columns[:, -2].copy())
         self._gain = mi.Float(columns[:, -1].copy())
+        binned, summed = _binned(columns[:, :-2].astype(np.float64))
+        self._binned = mi.Float(binned.astype(np.float32).ravel())
+        self._summed = mi.Float(summed.astype(np.float32).ravel())
+        self._all = mi.Float(summed[:, -1].astype(np.float32))
 
     @staticmethod
     def pack(optics: ContactOptics) -> mi.TensorXf:
@@ -48,9 +52,51 @@ class Table:
     def diffuse_gain(self, fraction: mi.Float, active: mi.Bool | bool = True) -> mi.Float:
         return self._row(self._gain, fraction, active)
 
+    def draw(
+        self, fraction: mi.Float, sample1: mi.Float, sample2: mi.Point2f, active: mi.Bool | bool = True
+    ) -> mi.Vector3f:
+        """Directions that fill the hemisphere as re-emitted light does, in proportion to T(cos) cos."""
+        i, u = _cell(fraction, self.rows)
+        low, high = (dr.gather(mi.Float, self._all, i + k, active) for k in (0, 1))
+        upper = sample1 * dr.lerp(low, high, u) >= (1.0 - u) * low
+        row = dr.select(upper, i + 1, i)
+        start = row * _BINS
+        aim = sample2.x * dr.gather(mi.Float, self._all, row, active)
+        found = dr.binary_search(
+            0, _BINS - 1, lambda k: dr.gather(mi.Float, self._summed, start + k, active) <= aim
+        )
+        end = dr.gather(mi.Float, self._summed, start + found, active)
+        height = dr.gather(mi.Float, self._binned, start + found, active)
+        within = dr.clip(1.0 - (end - aim) * _BINS / height, 0.0, 1.0)
+        squared = (mi.Float(found) + within) / _BINS  # of the cosine
+        sine, cosine = dr.sqrt(dr.maximum(1.0 - squared, 0.0)), dr.sqrt(squared)
+        s, c = dr.sincos(dr.two_pi * sample2.y)
+        return mi.Vector3f(sine * c, sine * s, cosine)
+
+    def density(self, fraction: mi.Float, cosine: mi.Float, active: mi.Bool | bool = True) -> mi.Float:
+        """Density of `draw` per solid angle, 1/sr."""
+        i, u = _cell(fraction, self.rows)
+        place = i * _BINS + dr.minimum(mi.UInt32(dr.square(cosine) * _BINS), _BINS - 1)
+        low, high = (dr.gather(mi.Float, self._binned, place + k * _BINS, active) for k in (0, 1))
+        low_all, high_all = (dr.gather(mi.Float, self._all, i + k, active) for k in (0, 1))
+        return dr.lerp(low, high, u) / dr.lerp(low_all, high_all, u) * cosine * dr.inv_pi
+
     def _row(self, data: mi.Float, fraction: mi.Float, active: mi.Bool | bool) -> mi.Float:
         i, u = _cell(fraction, self.rows)
         return dr.lerp(dr.gather(mi.Float, data, i, active), dr.gather(mi.Float, data, i + 1, active), u)
+
+
+_BINS = 512  # of squared cosine, in which `Table.draw` takes T as constant
+_FLOOR = 1e-4  # of T there: no direction is left out
+
+
+def _binned(transmittance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """T averaged over bins of squared cosine (uniform in cosine-weighted solid angle), and its sums."""
+    middles = np.sqrt((np.arange(4 * _BINS) + 0.5) / (4 * _BINS))
+    nodes = np.linspace(0.0, 1.0, transmittance.shape[1])
+    fine = np.stack([np.interp(middles, nodes, row) for row in transmittance])
+    binned = np.maximum(fine.reshape(len(fine), _BINS, 4).mean(axis=2), _FLOOR)
+    return binned, np.cumsum(binned, axis=1) / _BINS
 
 
 def _cell(x: mi.Float, nodes: int) -> tuple[mi.UInt32, mi.Float]:
@@ -96,20 +142,23 @@ class FrustratedTIR(mi.BSDF):
         is_mirror = sample1 < p_mirror
 
         bs = dr.zeros(mi.BSDFSample3f)
-        spread = mi.warp.square_to_cosine_hemisphere(sample2)
+        rest = (sample1 - p_mirror) / dr.maximum(1.0 - p_mirror, 1e-6)
+        if ctx.mode == mi.TransportMode.Importance:
+            spread = self.table.draw(a, rest, sample2, active)
+        else:
+            spread = mi.warp.square_to_cosine_hemisphere(sample2)
         cos_spread = mi.Frame3f.cos_theta(spread)
+        density = self._density(ctx, a, cos_spread, active)
         bs.wo = dr.select(is_mirror, mi.reflect(si.wi), spread)
-        bs.pdf = dr.select(
-            is_mirror, p_mirror, (1.0 - p_mirror) * mi.warp.square_to_cosine_hemisphere_pdf(spread)
-        )
+        bs.pdf = dr.select(is_mirror, p_mirror, (1.0 - p_mirror) * density)
         bs.eta = 1.0
         bs.sampled_type = dr.select(
             is_mirror, mi.UInt32(+mi.BSDFFlags.DeltaReflection), mi.UInt32(+mi.BSDFFlags.DiffuseReflection)
         )
         bs.sampled_component = dr.select(is_mirror, mi.UInt32(0), mi.UInt32(1))
         active &= bs.pdf > 0.0
-        re_emitted = diffuse * self.table.transmittance(a, cos_spread, active) / (1.0 - p_mirror)
-        weight = dr.select(is_mirror, albedo, re_emitted)
+        value = diffuse * self.table.transmittance(a, cos_spread, active) * cos_spread * dr.inv_pi
+        weight = dr.select(is_mirror, albedo, dr.select(bs.pdf > 0.0, value / bs.pdf, 0.0))
         return bs, mi.Color1f(weight) & active
 
     def eval(
@@ -134,12 +183,22 @@ class FrustratedTIR(mi.BSDF):
         mirror = mi.Float(1.0 if ctx.is_enabled(mi.BSDFFlags.DeltaReflection, 0) else 0.0) * (1.0 - t)
         albedo = mirror + t * gain * self.table.hemispherical(a, active)
         share = dr.select(albedo > 0.0, 1.0 - mirror / albedo, 0.0)
-        return dr.select(active, share * cos_o * dr.inv_pi, 0.0)
+        return dr.select(active, share * self._density(ctx, a, cos_o, active), 0.0)
 
     def eval_pdf(
         self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool | bool = True
     ) -> tuple[mi.Color1f, mi.Float]:
         return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
+
+    def _density(self, ctx: mi.BSDFContext, a: mi.Float, cosine: mi.Float, active: mi.Bool) -> mi.Float:
+        """Density of the diffuse directions, 1/sr.
+
+        Light from an LED follows the lobe, so that its weight stays that of the tissue's albedo; paths from
+        the camera are spread evenly, because LEDs are found in the trapped directions, a small part of it.
+        """
+        if ctx.mode == mi.TransportMode.Importance:
+            return self.table.density(a, cosine, active)
+        return dr.maximum(cosine, 0.0) * dr.inv_pi
 
     def _at(
         self, si: mi.SurfaceInteraction3f, cos_i: mi.Float, active: mi.Bool

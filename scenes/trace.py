@@ -174,7 +174,7 @@ def _re_emit(
 ) -> tuple[mi.Ray3f, mi.Float]:
     """Rays from the contact surface as the tissue re-emits the gathered light, and their share of the flux.
 
-    Even over the guide's face and cosine-weighted, so one ray of n carries F_landed K T(cos) area / n.
+    Even over the guide's face, directions as in the lobe: one of n rays carries F_landed K T_mean area / n.
     """
     width = sensor.guide.width_mm
     x, y = (u[0] - 0.5) * width, (u[1] - 0.5) * width
@@ -188,9 +188,12 @@ def _re_emit(
     for led, lamp in enumerate(sensor.leds):
         amount = dr.select(number == led, landed[led] * (width**2 / max(lamp.flux_W, 1e-30)), amount)
 
-    direction = mi.warp.square_to_cosine_hemisphere(mi.Point2f(u[2], u[3]))
-    back = table.transmittance(fraction, mi.Frame3f.cos_theta(direction), meets)
-    brightness = amount * table.diffuse_gain(fraction, meets) * back
+    # which of the table's two rows to draw from needs no even spread: any digits of the place will do
+    digits = u[0] * 4096.0
+    direction = table.draw(fraction, digits - dr.floor(digits), mi.Point2f(u[2], u[3]), meets)
+    cosine = mi.Frame3f.cos_theta(direction)
+    lobe = table.transmittance(fraction, cosine, meets) * cosine * dr.inv_pi
+    brightness = amount * table.diffuse_gain(fraction, meets) * lobe / table.density(fraction, cosine, meets)
     return si.spawn_ray(si.to_world(direction)), dr.select(meets, dr.maximum(brightness, 0.0), 0.0)
 
 

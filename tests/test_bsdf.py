@@ -177,11 +177,14 @@ def test_energy_balances_between_the_tables_nodes(mi: ModuleType) -> None:
 # Sampling
 
 
-def chi_square(mi: ModuleType, fraction: float, cosine: float, seed: int = 0, distort: Any = None) -> Any:
+def chi_square(
+    mi: ModuleType, fraction: float, cosine: float, mode: str = "Radiance", seed: int = 0, distort: Any = None
+) -> Any:
     """Mitsuba's own test: are as many directions drawn as `pdf` says, the mirror's left aside?"""
     from mitsuba import chi2
 
-    plugin, ctx, on = material(fraction), mi.BSDFContext(), mi.Bool(True)
+    ctx = mi.BSDFContext(getattr(mi.TransportMode, mode))
+    plugin, on = material(fraction), mi.Bool(True)
 
     def draws(u: Any) -> Any:
         si = arriving(mi, cosine, u.shape[1])
@@ -194,20 +197,43 @@ def chi_square(mi: ModuleType, fraction: float, cosine: float, seed: int = 0, di
         return value if distort is None else value * distort(wo)
 
     domain = chi2.SphericalDomain()
-    return chi2.ChiSquareTest(domain, draws, density, sample_dim=3, sample_count=300_000, res=31, seed=seed)
+    return chi2.ChiSquareTest(
+        domain, draws, density, sample_dim=3, sample_count=300_000, res=31, ires=24, seed=seed
+    )
 
 
 @pytest.mark.parametrize("fraction", [0.003, 0.13, 1.0])
 @pytest.mark.parametrize("cosine", [0.3, 0.72, 1.0])
+@pytest.mark.parametrize("mode", ["Radiance", "Importance"])
 def test_samples_pass_the_chi_square_test(
-    mi: ModuleType, fraction: float, cosine: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    mi: ModuleType,
+    fraction: float,
+    cosine: float,
+    mode: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """In number as well as in direction: the diffuse share of all samples is 0.3 % to all of them."""
     monkeypatch.chdir(tmp_path)  # a failing test writes its histograms where it stands
-    test = chi_square(mi, fraction, cosine, seed=int(100 * (fraction + cosine)))
-    passed = test.run(significance_level=0.01, test_count=9)
-    print(f"A_r {fraction}, cos {cosine}: p-value {test.p_value:.3f}")
+    test = chi_square(mi, fraction, cosine, mode, seed=int(100 * (fraction + cosine)))
+    passed = test.run(significance_level=0.01, test_count=18)
+    print(f"A_r {fraction}, cos {cosine}, {mode}: p-value {test.p_value:.3f}")
     assert passed, test.messages
+
+
+@pytest.mark.parametrize("fraction", [0.003, 0.13, 0.5039, 1.0])  # on a node of the table and between
+def test_light_from_an_led_keeps_the_weight_of_the_albedo(mi: ModuleType, fraction: float) -> None:
+    """Drawn as the lobe is, no sample outweighs another: else weights grow from bounce to bounce."""
+    ctx = mi.BSDFContext(mi.TransportMode.Importance)
+    u = [mi.Float(row.astype(np.float32)) for row in even_numbers(2**17)]
+    _, weight = material(fraction).sample(
+        ctx, arriving(mi, 0.4, 2**17), u[0], mi.Point2f(u[1], u[2]), mi.Bool(True)
+    )
+    weight = np.asarray(weight[0])
+    transmittance, mean, gain = look_up(fraction, np.array(0.4))
+    albedo = 1.0 - transmittance + transmittance * gain * mean
+    assert weight.mean(dtype=np.float64) == pytest.approx(float(albedo), abs=1e-4)
+    assert np.quantile(weight, 0.999) < 1.1 * albedo
 
 
 def test_component_alone_passes_mitsubas_own_adapter(
