@@ -204,6 +204,7 @@ class FrustratedTIR(mi.BSDF):
         self, si: mi.SurfaceInteraction3f, cos_i: mi.Float, active: mi.Bool
     ) -> tuple[mi.Float, mi.Float, mi.Float]:
         a = self.fraction.eval_1(si, active)
+        a = dr.select(dr.isfinite(a), a, 0.0)  # slivers at a pressed-back rim have no barycentric coordinates
         return a, self.table.transmittance(a, cos_i, active), self.table.diffuse_gain(a, active)
 
     def to_string(self) -> str:

@@ -109,9 +109,10 @@ def triangulate(surface: OpticalSurface) -> trimesh.Trimesh:
     x, y = np.meshgrid(lines, lines)
     position = np.stack([x, y, np.zeros_like(x)], axis=-1) + surface.displacement_mm
     position = np.pad(position, ((1, 1), (1, 1), (0, 0)), mode="edge")
-    limit = (
-        lines[-1] + _LIP_MM - 1e-5 * np.arange(lines.size + 2)[::-1]
-    )  # rising, so that no triangle degenerates
+    # rising, so that no triangle degenerates: 0.1 µm is the least at which single precision still tells
+    # where in a triangle a point lies
+    rank = np.arange(lines.size + 2)[::-1]
+    limit = lines[-1] + _LIP_MM * (1.0 - np.minimum(rank, 19) / 20)
     for axis, shape in enumerate(((1, -1), (-1, 1))):
         outward = limit.reshape(shape)
         inward = -np.flip(outward)

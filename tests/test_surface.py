@@ -257,6 +257,30 @@ def test_sideways_displacement_carries_pressure_along(mi: ModuleType, scene: Any
     np.testing.assert_allclose(ours, expected, atol=1e-5)
 
 
+@pytest.mark.parametrize("name", DEFORMATIONS)
+def test_contact_is_known_to_the_very_rim(mi: ModuleType, scene: Any, name: str) -> None:
+    """Where the rim is pressed back its triangles are 0.1 µm wide: enough for single precision."""
+    from scenes import build
+
+    sensor = paper_sensor()
+    build.put_surface(scene, sensor, shaped(DEFORMATIONS[name], pressure=lambda x, y: 0.9 + 0.02 * (x + y)))
+    rng = np.random.default_rng(10)
+    across, along = rng.uniform(0.0, 1.99e-3, 200_000) + HALF_MM, rng.uniform(-12.0, 12.0, 200_000)
+    for x, y in ((across, along), (-across, along), (along, across), (along, -across)):
+        # from within the lip, above the walls' lower end and below the surface
+        origin = mi.Point3f(mi.Float(x), mi.Float(y), mi.Float(-0.5))
+        si = scene.ray_intersect(mi.Ray3f(origin, mi.Vector3f(0, 0, 1)))
+        contact = next(shape for shape in scene.shapes() if shape.id() == "contact")
+        hit = np.asarray(si.shape == mi.ShapePtr(contact))
+        assert hit.mean() > 0.99
+        fraction = np.asarray(contact.eval_attribute_1("vertex_contact_fraction", si))[hit]
+        skin = sensor.skin
+        pressure = 0.9 + 0.02 * (np.asarray(si.p.x) + np.asarray(si.p.y))[hit]
+        expected = contact_fraction(pressure, sensor.effective_modulus_kPa, skin.rms_slope, skin.kappa)
+        assert np.all(np.isfinite(fraction))
+        np.testing.assert_allclose(fraction, expected, atol=0.01 * expected.max())
+
+
 def test_updating_many_times_costs_no_reload(mi: ModuleType, scene: Any) -> None:
     """The mesh keeps its buffers' sizes and its place in the scene over many presses."""
     from scenes import build
