@@ -163,6 +163,7 @@ class Renderer:
             )
             layers.append(mean.astype(np.float32))
             variance = variance + error**2
+        build.light_only(self.scene, self.sensor, None)
         radiance = np.stack(layers)
         relative = np.sqrt(variance) / np.maximum(radiance.sum(axis=0), 1e-30)
         return radiance, float(100.0 * np.median(relative))
