@@ -12,7 +12,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 from scipy.ndimage import correlate1d
 
 from .contact import ContactOptics
@@ -20,6 +19,7 @@ from .contact import ContactOptics
 Array = NDArray[np.float64]
 
 _SMOOTHING_CELLS = 2.5  # standard deviation of the smoothing kernel
+_RIM_CELLS = 2  # 0.5 mm
 
 
 @dataclass(frozen=True)
@@ -85,17 +85,17 @@ def land(
 
 
 def smooth(irradiance: Array, factor: int = 4) -> Array:
-    """Smoothed irradiance on a grid `factor` times finer, over the last two axes, mirrored at the edges.
+    """Smoothed irradiance on a grid `factor` times finer over the last two axes.
 
-    The kernel 2 G - G * G has no second moment, so the curvature of the irradiance survives; cubic splines
-    interpolate.
+    The kernel 2 G - G * G has no second moment, so the curvature of the irradiance survives. It is mirrored
+    at the rim, where the surface bends and light changes from cell to cell: those cells keep their own values.
     """
-    return _along_both(_smoothing_matrix(irradiance.shape[-1], factor, smoothed=True), irradiance)
+    return _along_both(_smoothing_matrix(irradiance.shape[-1], factor, _SMOOTHING_CELLS), irradiance)
 
 
 def refine(irradiance: Array, factor: int) -> Array:
-    """Values on a grid `factor` times finer over the last two axes, by cubic splines."""
-    return _along_both(_smoothing_matrix(irradiance.shape[-1], factor, smoothed=False), irradiance)
+    """Values on a grid `factor` times finer over the last two axes, linear in between."""
+    return _along_both(_smoothing_matrix(irradiance.shape[-1], factor, 0.0), irradiance)
 
 
 def _along_both(step: Array, irradiance: Array) -> Array:
@@ -103,15 +103,17 @@ def _along_both(step: Array, irradiance: Array) -> Array:
     return np.einsum("yi,...ij,xj->...yx", step, irradiance, step, optimize=["einsum_path", (0, 1), (0, 1)])
 
 
-@lru_cache(maxsize=4)
-def _smoothing_matrix(cells: int, factor: int, *, smoothed: bool) -> Array:
-    """(factor * cells, cells): smooth along one axis if asked to, then refine by cubic splines."""
-    reach = int(np.ceil(6 * _SMOOTHING_CELLS))
-    gauss = np.exp(-0.5 * (np.arange(-reach, reach + 1) / _SMOOTHING_CELLS) ** 2)
-    gauss /= gauss.sum()
-    twice = np.convolve(gauss, gauss)
-    kernel = -twice
-    kernel[reach:-reach] += 2.0 * gauss
-    cell_values = correlate1d(np.eye(cells), kernel, axis=0, mode="reflect") if smoothed else np.eye(cells)
+@lru_cache(maxsize=8)
+def _smoothing_matrix(cells: int, factor: int, sigma: float) -> Array:
+    """(factor * cells, cells): smooth along one axis, then interpolate at the finer cells' middles."""
+    smoothed = np.eye(cells)
+    if sigma > 0.0:
+        reach = int(np.ceil(6 * sigma))
+        gauss = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
+        gauss /= gauss.sum()
+        kernel = -np.convolve(gauss, gauss)
+        kernel[reach:-reach] += 2.0 * gauss
+        inner = slice(_RIM_CELLS, cells - _RIM_CELLS)
+        smoothed[inner, inner] = correlate1d(smoothed[inner, inner], kernel, axis=0, mode="reflect")
     middles, finer = np.arange(cells) + 0.5, (np.arange(factor * cells) + 0.5) / factor
-    return np.asarray(CubicSpline(middles, cell_values)(finer))
+    return np.stack([np.interp(finer, middles, column) for column in smoothed.T], axis=1)

@@ -21,8 +21,11 @@ if TYPE_CHECKING:
 
 Quality = Literal["preview", "standard", "reference"]
 
-PATHS_PER_LED = {"preview": 2**17, "standard": 2**21}
+PATHS_PER_LED = {"preview": 2**17, "standard": 2**22}
 """Light paths that the traced qualities spend on each LED; "reference" has samples per pixel instead."""
+
+_PATHS_PER_PASS = 2**20  # independent passes bound the memory and tell the noise
+_MOST_PASSES = 64  # so that seeds of passes do not meet
 
 REFERENCE_SAMPLES = 4096
 """Samples per pixel of a reference picture."""
@@ -41,8 +44,8 @@ class Rendering:
     pressure, displacement_z : (rows, columns)
         Contact pressure, kPa, and displacement, mm (+z into the specimen), at that point.
     noise_percent : float
-        Standard error of the radiance of all LEDs together from Monte Carlo, in per cent of it, median over
-        the pixels; measured from independent halves (traced) or from the spread of the samples (reference).
+        Standard error of the radiance of all LEDs together from Monte Carlo: root mean square over the pixels,
+        in per cent of the mean; from the spread of independent passes (traced) or of the samples (reference).
     seconds : float
         Wall-clock time.
     """
@@ -131,19 +134,25 @@ class Renderer:
         from . import direct, gather, irradiance, trace
 
         straight = direct.direct(self.sensor, self.basis, shape)
-        halves = []
-        for half in (0, 1):
+        passes = max(2, -(-samples // _PATHS_PER_PASS))
+        runs = []
+        for number in range(passes):
             landed = trace.trace(
-                self.scene, self.sensor, self.table, self.basis, straight, samples // 2, 2 * seed + half
+                self.scene,
+                self.sensor,
+                self.table,
+                self.basis,
+                straight,
+                max(samples // passes, 2),
+                seed * _MOST_PASSES + number,
             )
-            halves.append(gather.picture(sight, self.basis, straight + irradiance.smooth(landed)))
-            tell(0.5 * (half + 1))
-        radiance = 0.5 * (halves[0] + halves[1])
-        both = [layers.sum(axis=0, dtype=np.float64) for layers in halves]
-        spread, mean = 0.5 * np.abs(both[0] - both[1]), 0.5 * (both[0] + both[1])
-        # half the difference of the halves is one draw of the mean's error, |error| of a normal has median
-        # 0.6745 sigma
-        return radiance, float(100.0 * np.median(spread / np.maximum(mean, 1e-30)) / 0.6745)
+            runs.append(gather.picture(sight, self.basis, straight + irradiance.smooth(landed)))
+            tell((number + 1) / passes)
+        radiance = np.mean(runs, axis=0, dtype=np.float64)
+        totals = np.sum(runs, axis=1, dtype=np.float64)
+        spread = np.std(totals, axis=0, ddof=1) / np.sqrt(passes)
+        relative = np.sqrt(np.mean(spread**2)) / max(np.mean(totals), 1e-30)
+        return radiance.astype(np.float32), float(100.0 * relative)
 
     def _reference(
         self, samples: int, seed: int, tell: Callable[[float], None]
@@ -165,5 +174,5 @@ class Renderer:
             variance = variance + error**2
         build.light_only(self.scene, self.sensor, None)
         radiance = np.stack(layers)
-        relative = np.sqrt(variance) / np.maximum(radiance.sum(axis=0), 1e-30)
-        return radiance, float(100.0 * np.median(relative))
+        relative = np.sqrt(np.mean(variance)) / max(np.mean(radiance.sum(axis=0)), 1e-30)
+        return radiance, float(100.0 * relative)
