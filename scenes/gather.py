@@ -18,6 +18,8 @@ from .irradiance import AngularBasis, land
 from .sensor import Sensor
 from .view import PixelRays, faces_reflectance
 
+_STEP_MM = 1e-3  # off a face before looking on
+_ASIDE_MM = (1.3e-4, 0.7e-4, 0.0)  # along neither the sides nor the diagonals of the mesh
 _SIGHTS = 2  # the surface seen directly, and mirrored once in the lower faces; a third sight adds 1e-5
 
 
@@ -33,7 +35,7 @@ class Sight:
         For each sight, on the device: position in units of the guide's width (0..1), real contact fraction,
         and radiance at the camera per transmitted irradiance, 1/sr.
     lamps : (n_led, rows, columns)
-        Radiance at the camera, W mm⁻² sr⁻¹, of LEDs that stand in the way (embedded ones).
+        Radiance at the camera, W mm⁻² sr⁻¹, of LEDs in sight: embedded ones, straight or mirrored.
     """
 
     position_mm: NDArray[np.float32]
@@ -51,47 +53,60 @@ def look(scene: mi.Scene, sensor: Sensor, table: Table, rays: PixelRays) -> Sigh
     mirrored = mi.Float(faces_reflectance(sensor, rays.direction[..., 2]).astype(np.float32).ravel())
     contact = next(shape for shape in scene.shapes() if shape.id() == "contact")
 
+    named = {shape.id(): mi.ShapePtr(shape) for shape in scene.shapes()}
+    lamps = [mi.Float(0.0) for _ in sensor.leds]
     points = []
-    lamps = _lamps(scene, sensor, mi.Point3f(*origin), direction, gain).reshape(len(sensor.leds), *shape)
-    start = mi.Point3f(origin[0], origin[1], origin[2] + 1e-3)
+    start = mi.Point3f(*origin) + _STEP_MM / direction.z * direction
     for _ in range(_SIGHTS):
-        si = scene.ray_intersect(mi.Ray3f(start, direction))
-        seen = si.is_valid() & (si.shape == mi.ShapePtr(contact))
+        si = _meet(scene, named["contact"], start, direction)
+        seen = si.is_valid() & (si.shape == named["contact"])
+        _add_lamps(lamps, si, gain, sensor, named)
         cosine = mi.Frame3f.cos_theta(si.wi)
         fraction = dr.select(seen, contact.eval_attribute_1("vertex_contact_fraction", si, seen), 0.0)
         transmitted = table.transmittance(fraction, cosine, seen)
-        emitted = transmitted * table.diffuse_gain(fraction, seen) * dr.inv_pi
-        points.append(
-            (
-                si.p.x / guide.width_mm + 0.5,
-                si.p.y / guide.width_mm + 0.5,
-                fraction,
-                dr.select(seen, gain * emitted, 0.0),
-            )
-        )
-        # mirrored in the contact surface, down, mirrored in the lower faces, up again; the deformation's
-        # slope left out
-        gain = dr.select(seen, gain * (1.0 - transmitted) * mirrored, 0.0)
+        emitted = dr.select(seen, gain * transmitted * table.diffuse_gain(fraction, seen) * dr.inv_pi, 0.0)
+        points.append((si.p.x / guide.width_mm + 0.5, si.p.y / guide.width_mm + 0.5, fraction, emitted))
+        # mirrored in the contact surface, down, mirrored in the lower faces, up again; the slope left out
+        gain = dr.select(seen, gain * (1.0 - transmitted), 0.0)
+        down = mi.Vector3f(direction.x, direction.y, -direction.z)
+        below = scene.ray_intersect(mi.Ray3f(si.p + _STEP_MM * down, down), seen)
+        _add_lamps(lamps, below, gain, sensor, named)
+        gain = dr.select(below.shape == named["guide_to_glass"], gain * mirrored, 0.0)
         run = (si.p.z + guide.thickness_mm) / direction.z
-        start = mi.Point3f(si.p.x + run * direction.x, si.p.y + run * direction.y, -guide.thickness_mm + 1e-3)
-    dr.eval(points)
+        start = mi.Point3f(si.p.x, si.p.y, -guide.thickness_mm) + mi.Vector3f(
+            run * direction.x, run * direction.y, 0.0
+        )
+        start += _STEP_MM / direction.z * direction
+    dr.eval(points, lamps)
     x, y = (np.asarray(points[0][i]).reshape(shape) for i in (0, 1))
     position = (np.stack([x, y], axis=-1) - 0.5) * guide.width_mm
-    return Sight(position.astype(np.float32), points, lamps)
+    layers = np.stack([np.broadcast_to(np.asarray(layer), x.size).reshape(shape) for layer in lamps])
+    return Sight(position.astype(np.float32), points, layers)
 
 
-def _lamps(
-    scene: mi.Scene, sensor: Sensor, origin: mi.Point3f, direction: mi.Vector3f, gain: mi.Float
-) -> NDArray[np.float32]:
-    """Radiance at the camera of LEDs that the pixels' rays meet from the front."""
-    named = {shape.id(): mi.ShapePtr(shape) for shape in scene.shapes()}
-    si = scene.ray_intersect(mi.Ray3f(origin, direction))
+def _meet(
+    scene: mi.Scene, contact: mi.ShapePtr, start: mi.Point3f, direction: mi.Vector3f
+) -> mi.SurfaceInteraction3f:
+    """Where rays going up meet the scene; one that slips between two triangles tries again a hair aside."""
+    si = scene.ray_intersect(mi.Ray3f(start, direction))
+    slipped = ~(si.is_valid() & (si.shape == contact))
+    aside = mi.Ray3f(start + mi.Vector3f(*_ASIDE_MM), direction)
+    again = scene.ray_intersect(aside, slipped)
+    return dr.select(slipped & again.is_valid() & (again.shape == contact), again, si)
+
+
+def _add_lamps(
+    lamps: list[mi.Float],
+    si: mi.SurfaceInteraction3f,
+    gain: mi.Float,
+    sensor: Sensor,
+    named: dict[str, mi.ShapePtr],
+) -> None:
+    """Add the radiance at the camera of the LEDs whose front these rays meet."""
     front = si.is_valid() & (mi.Frame3f.cos_theta(si.wi) > 0.0)
-    layers = []
     for number, led in enumerate(sensor.leds):
         meets = front & (si.shape == named[f"led_{number}"])
-        layers.append(np.asarray(dr.select(meets, gain * radiance(led), 0.0)))
-    return np.stack(layers)
+        lamps[number] += dr.select(meets, gain * radiance(led), 0.0)
 
 
 def picture(sight: Sight, basis: AngularBasis, irradiance: NDArray[np.float64]) -> NDArray[np.float32]:

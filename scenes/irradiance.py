@@ -88,7 +88,7 @@ def smooth(irradiance: Array, factor: int = 4) -> Array:
     """Smoothed irradiance on a grid `factor` times finer over the last two axes.
 
     The kernel 2 G - G * G has no second moment, so the curvature of the irradiance survives. It is mirrored
-    at the rim, where the surface bends and light changes from cell to cell: those cells keep their own values.
+    at the rim, where the surface bends and light changes from cell to cell: those cells keep their values.
     """
     return _along_both(_smoothing_matrix(irradiance.shape[-1], factor, _SMOOTHING_CELLS), irradiance)
 

@@ -44,8 +44,8 @@ class Rendering:
     pressure, displacement_z : (rows, columns)
         Contact pressure, kPa, and displacement, mm (+z into the specimen), at that point.
     noise_percent : float
-        Standard error of the radiance of all LEDs together from Monte Carlo: root mean square over the pixels,
-        in per cent of the mean; from the spread of independent passes (traced) or of the samples (reference).
+        Standard error of the radiance of all LEDs together from Monte Carlo: root mean square over pixels, in
+        per cent of the mean; from the spread of independent passes (traced) or of the samples (reference).
     seconds : float
         Wall-clock time.
     """
@@ -148,7 +148,7 @@ class Renderer:
             )
             runs.append(gather.picture(sight, self.basis, straight + irradiance.smooth(landed)))
             tell((number + 1) / passes)
-        radiance = np.mean(runs, axis=0, dtype=np.float64)
+        radiance = np.asarray(np.mean(runs, axis=0, dtype=np.float64))
         totals = np.sum(runs, axis=1, dtype=np.float64)
         spread = np.std(totals, axis=0, ddof=1) / np.sqrt(passes)
         relative = np.sqrt(np.mean(spread**2)) / max(np.mean(totals), 1e-30)

@@ -118,7 +118,8 @@ def _walk(
         cosine = mi.Frame3f.cos_theta(si.wi)
         on_contact = alive & (si.shape == contact) & (cosine > 0.0)
         gathered = on_contact & ((leg == _IN_GUIDE) | (leg == _BACK_UP))  # `direct` has counted these
-        lands = on_contact & ~gathered
+        # folded against a wall, the rim stands upright: the map, seen from below, has no area there
+        lands = on_contact & ~gathered & (si.n.z < -0.5)
         column = mi.UInt32(dr.clip((si.p.x / width + 0.5) * CELLS, 0.0, CELLS - 1.0))
         row = mi.UInt32(dr.clip((si.p.y / width + 0.5) * CELLS, 0.0, CELLS - 1.0))
         for k, weight in enumerate(weigh(weights, count, n_cos, cosine, lands)):
