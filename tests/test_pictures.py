@@ -44,7 +44,13 @@ def make_design() -> SimpleNamespace:
         glass=SimpleNamespace(thickness_mm=2.0),
         leds=[SimpleNamespace(side=side, **led) for side in ("+x", "-x", "+y", "-y")],
         camera=SimpleNamespace(
-            field_of_view_mm=25.0, field_height_mm=18.69, distance_mm=40.0, bits=8, rows=ROWS, columns=COLUMNS
+            field_of_view_mm=25.0,
+            field_height_mm=18.69,
+            distance_mm=40.0,
+            exposure_ms=6.0,
+            bits=8,
+            rows=ROWS,
+            columns=COLUMNS,
         ),
         specimen=SimpleNamespace(thickness_mm=30.0, width_mm=60.0, modulus_kPa=5.0),
         signal=SimpleNamespace(displacement_um=2.0, counts=10.0),
@@ -229,7 +235,56 @@ def awkward() -> SimpleNamespace:
     return frame
 
 
-@pytest.mark.parametrize("frame", [make_frame(), make_frame(0.0), make_frame(2.0, 5.0, 120.0), awkward()])
+def dark() -> SimpleNamespace:
+    """A frame taken with every LED failed."""
+    frame = make_frame()
+    frame.radiance = np.zeros_like(frame.radiance)
+    frame.image, frame.tared = np.full_like(frame.image, 4), np.zeros_like(frame.tared)
+    frame.tsis["saturated_percent"] = 0.0
+    return frame
+
+
+def narrow() -> SimpleNamespace:
+    """A frame of a guide and a field of view of 20 mm, one of the LEDs inside the guide."""
+    frame = make_frame()
+    frame.design.waveguide.width_mm = frame.design.camera.field_of_view_mm = 20.0
+    frame.design.camera.field_height_mm = 14.95
+    frame.design.leds[0].coupling = "embedded"
+    frame.surface.points[:, :2] *= 0.8
+    return frame
+
+
+def texts(frame: SimpleNamespace) -> list[str]:
+    """Everything that the sheet says, but for tick labels."""
+    with mpl.rc_context(STYLE):
+        canvas = FigureCanvasAgg(Figure(figsize=(WIDTH_PX / DPI, HEIGHT_PX / DPI), dpi=DPI))
+        draw_sheet(canvas.figure, frame)
+        return [text.get_text() for text in canvas.figure.findobj(Text)]
+
+
+def test_no_light_is_black_and_says_so(tmp_path):
+    overview(dark(), tmp_path / "a.png")
+    radiance = pixels(tmp_path / "a.png")[110:200, 1270:1400]
+    assert radiance.max() < 8
+    assert "no light" in texts(dark()) and "no light" not in texts(make_frame())
+
+
+def test_sheet_says_how_it_was_made():
+    said = texts(narrow())
+    assert {"3 through air, 1 embedded", "6 ms", "LED (beyond the edge, at the guide's side)"} <= set(said)
+    assert "saturated pixels" not in said and "saturated pixels" in texts(dark())
+
+
+@pytest.mark.filterwarnings("error")
+def test_names_that_the_type_cannot_write_draw_no_warning(tmp_path):
+    frame = make_frame()
+    frame.design.name = "触覚 $\\frac{ $"
+    overview(frame, tmp_path / "a.png")
+
+
+@pytest.mark.parametrize(
+    "frame", [make_frame(), make_frame(0.0), make_frame(2.0, 5.0, 120.0), awkward(), dark(), narrow()]
+)
 def test_no_text_runs_into_another_or_off_the_sheet(frame, monkeypatch):
     drawn: dict[int, Text] = {}  # what is drawn, without the tick labels that matplotlib keeps in reserve
     draw = Text.draw

@@ -9,11 +9,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.patches import Rectangle
+from matplotlib.ticker import MaxNLocator
 from matplotlib.tri import LinearTriInterpolator, Triangulation
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
-from twin.panels import FAINT, INCLUSION, INK, INNER, LED, Pictured, quads, scale_bar, triangles
+from twin.panels import FAINT, INCLUSION, INK, INNER, LED, ROUND, Pictured, quads, scale_bar, triangles
 
 TISSUE, GLASS, WALL, PRESSURE = "#f3ddcf", "#d5e8df", "#d0d0d0", "#2b6ca3"
 LAYERS = ("#deebf7", "#9ecae1", "#4a90c4", "#2b6ca3", "#1f4e79")
@@ -47,9 +48,12 @@ def draw_cut(axes: Axes, frame: Pictured, letter: str) -> None:
         face = half + (led.gap_mm if led.coupling == "air" else -led.gap_mm)
         corner = (min(sign * face, sign * (face + 0.8)), led.z_mm - led.diameter_mm / 2)
         axes.add_patch(Rectangle(corner, 0.8, led.diameter_mm, facecolor=LED, zorder=4, **edge))
+    low, high = bottom - glass - 2.6, slab.thickness_mm + 5.0
+    box = axes.get_window_extent()
+    spare = max(0.0, (high - low) * box.width / box.height - (2 * wide + 9)) / 2  # keeps the names inside
+    axes.set_xlim(-wide - 3 - spare, wide + 6 + spare)
+    axes.set_ylim(low, high)
     _name_the_parts(axes, frame, bottom, wall)
-    axes.set_xlim(-wide - 3, wide + 6)
-    axes.set_ylim(bottom - glass - 2.6, slab.thickness_mm + 1.5)
     axes.set_aspect("equal", anchor="N")
     axes.set_xlabel("x, mm")
     axes.set_ylabel("z, mm (into the tissue)")
@@ -63,6 +67,8 @@ def _name_the_parts(axes: Axes, frame: Pictured, bottom: float, wall: float) -> 
     axes.text(left, wall - 1.2, f"tissue {slab.modulus_kPa:g} kPa", va="top", fontsize=7.5)
     paper: dict[str, Any] = {"facecolor": "white", "edgecolor": "none", "pad": 1.5}
     axes.text(0, wall + 1.15, "chest wall (fixed)", ha="center", va="center", bbox=paper)
+    at_rest = "drawn with the probe at rest; the chest wall comes down"
+    axes.text(0, slab.thickness_mm + 4.4, at_rest, fontsize=6.5, ha="center", va="top", color=FAINT)
     if frame.inclusion is not None:
         _name_the_inclusion(axes, frame)
     parts, top = [], 0.0
@@ -94,7 +100,8 @@ def _name_the_inclusion(axes: Axes, frame: Pictured) -> None:
     moved = (np.asarray(mesh.points) + np.asarray(mesh.point_data["displacement"]))[np.unique(inside)]
     (left, _, low), (right, _, high) = moved.min(axis=0), moved.max(axis=0)
     middle = (low + high) / 2
-    if right - left >= 7:
+    (first, last), wide = axes.get_xlim(), axes.get_window_extent().width
+    if (right - left) * wide / (last - first) >= 72:  # pixels: the name fits in
         place, side, colour = (left + right) / 2, "center", "white"
     else:
         place, side, colour = right + 1, "left", INCLUSION
@@ -115,7 +122,7 @@ def draw_profiles(rows: Sequence[Axes], frame: Pictured, letter: str) -> None:
     pushed = np.asarray(data["displacement_0"])[:, 2] - np.asarray(data["displacement"])[:, 2]
     rows[0].plot(x, 1e3 * _along_x(frame, pushed, x), color=INCLUSION, lw=1.2)
     rows[0].plot(points[nodes, 0], 1e3 * pushed[nodes], ".", color=INCLUSION, ms=2.5)
-    _threshold(rows[0], half, signal.displacement_um, f"k = {signal.displacement_um:g} µm")
+    _threshold(rows[0], signal.displacement_um, f"k = {signal.displacement_um:g} µm")
     rows[0].set_ylabel("pushed in\nµm, tared", fontsize=6.5)
 
     pressure, pressure_0 = (np.asarray(data[name], float) for name in ("pressure", "pressure_0"))
@@ -135,29 +142,30 @@ def draw_profiles(rows: Sequence[Axes], frame: Pictured, letter: str) -> None:
     band = counts[max(middle - 8, 0) : middle + 9].mean(axis=0)
     columns = ((np.arange(counts.shape[1]) + 0.5) / counts.shape[1] - 0.5) * width
     rows[2].plot(columns, uniform_filter1d(band, 5), color="#4d4d4d", lw=1.2)
-    _threshold(rows[2], half, signal.counts, f"k = {signal.counts:g}")
+    _threshold(rows[2], signal.counts, f"k = {signal.counts:g}")
     rows[2].set_ylabel("picture\ncounts, tared", fontsize=6.5)
     rows[2].set_xlabel("x, mm")
 
     for axes in rows:
         axes.set_xlim(-half, half)
+        axes.xaxis.set_major_locator(MaxNLocator(5, steps=ROUND))
         axes.spines[["top", "right"]].set_visible(False)
         axes.yaxis.set_label_coords(-0.085, 0.5)
         if found is not None:
             ends = found.offset[0] - found.size / 2, found.offset[0] + found.size / 2
             axes.axvspan(*ends, color=INCLUSION, alpha=0.08, lw=0)
         if axes is not rows[2]:
-            axes.set_xticklabels([])
-    if found is not None:
-        where: dict[str, Any] = {"ha": "center", "transform": rows[2].get_xaxis_transform()}
-        rows[2].text(found.offset[0], 0.06, "inclusion", fontsize=6, color=INCLUSION, **where)
-    rows[0].set_title(f"{letter}  What the inclusion adds, along y = 0")
+            axes.tick_params(labelbottom=False)
+    what = "What the inclusion adds, along y = 0 (shaded: inclusion)"
+    rows[0].set_title(f"{letter}  {what if found is not None else 'Along y = 0, on plain tissue'}")
 
 
-def _threshold(axes: Axes, half: float, level: float, text: str) -> None:
+def _threshold(axes: Axes, level: float, text: str) -> None:
+    """A dashed level, named beside the panel, where no curve can run into the name."""
     axes.margins(y=0.15)
     axes.axhline(level, color=FAINT, lw=0.6, ls="--")
-    axes.text(half * 0.99, level, text, fontsize=6, ha="right", va="bottom", color=FAINT)
+    place = axes.get_yaxis_transform()
+    axes.text(1.01, level, text, fontsize=6, va="center", color=FAINT, transform=place)
 
 
 def _along_x(frame: Pictured, values: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colorbar import Colorbar
 from matplotlib.colors import Normalize
 from matplotlib.patches import Circle, Rectangle
 from matplotlib.ticker import MaxNLocator
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
 
 INK, FAINT, LED, INCLUSION = "#1a1a1a", "#777777", "#f2b200", "#a63603"
 DASHED = (0, (4, 3))
+ROUND = (1, 2, 5, 10)
+"""Steps of the ticks: whole millimetres make short labels."""
 
 INNER = 0.88
 """Share of the probe's half width that colours and scales span: the pressure is singular at the rim."""
@@ -106,13 +109,18 @@ def draw_radiance(axes: Axes, frame: Pictured, letter: str) -> None:
     total = np.asarray(frame.radiance, np.float64).sum(axis=0)
     rows, columns = total.shape
     inner = total[rows // 8 : rows - rows // 8, columns // 8 : columns - columns // 8]
-    low, high = float(inner.min()), float(inner.max())
+    low, high = max(float(inner.min()), 0.0), max(float(inner.max()), 0.0)
+    if low == high:  # even light has no span of its own: show it against the dark
+        low, high = 0.0, high or 1.0
     drawn = axes.imshow(
         total, cmap="inferno", extent=_extent(frame), interpolation="nearest", vmin=low, vmax=high
     )
     below, above = total.min() < low, total.max() > high
     extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get((below, above), "neither")
-    _colour_bar(axes, drawn, "W m⁻² sr⁻¹", extend=extend)
+    bar = _colour_bar(axes, drawn, "W m⁻² sr⁻¹", extend=extend)
+    if not total.any():
+        bar.set_ticks([0.0])
+        axes.text(0.5, 0.5, "no light", color="white", fontsize=9, ha="center", transform=axes.transAxes)
     _led_marks(axes, frame)
     _outline(axes, frame, "white")
     _millimetres(axes, _extent(frame))
@@ -171,8 +179,10 @@ def draw_relief(axes: Any, frame: Pictured) -> None:
     }
     axes.plot_surface(*np.meshgrid(x, y), small, rcount=64, ccount=96, **style)
     axes.set_zlim(low, high)
+    axes.xaxis.set_major_locator(MaxNLocator(4, steps=ROUND))
+    axes.yaxis.set_major_locator(MaxNLocator(4, steps=ROUND))
     axes.zaxis.set_major_locator(MaxNLocator(4))
-    axes.set_box_aspect((extent[1], extent[3], 5.5))
+    axes.set_box_aspect((extent[1], extent[3], 0.44 * max(extent[1], extent[3])), zoom=0.94)
     axes.view_init(elev=32, azim=-62)
     axes.tick_params(labelsize=6, pad=-2)
     axes.set_xlabel("x, mm", labelpad=-4)
@@ -185,12 +195,13 @@ def _extent(frame: Pictured) -> tuple[float, float, float, float]:
     return (-width / 2, width / 2, -height / 2, height / 2)
 
 
-def _colour_bar(axes: Axes, drawn: Any, label: str, extend: str = "neither") -> None:
+def _colour_bar(axes: Axes, drawn: Any, label: str, extend: str = "neither") -> Colorbar:
     beside = axes.inset_axes((1.025, 0.0, 0.03, 1.0))  # leaves the panel its size
     bar = axes.figure.colorbar(drawn, cax=beside, extend=extend)
     bar.outline.set_linewidth(0.5)
     bar.set_label(label, fontsize=6.5, labelpad=2)
     beside.tick_params(labelsize=6.5)
+    return bar
 
 
 def _outline(axes: Axes, frame: Pictured, colour: str) -> None:
@@ -202,23 +213,32 @@ def _outline(axes: Axes, frame: Pictured, colour: str) -> None:
 
 
 def _led_marks(axes: Axes, frame: Pictured) -> None:
-    """A mark on the picture's border for every LED, pointing the way it shines."""
+    """A mark for every LED, pointing the way it shines; on the border where the LED lies beyond it."""
     left, right, low, high = _extent(frame)
+    beyond, marks = False, []
     for led in frame.design.leds:
-        along = led.along_mm
+        along, face = led.along_mm, frame.design.waveguide.width_mm / 2
+        away = face + (led.gap_mm if led.coupling == "air" else -led.gap_mm)
         x, y, mark = {
-            "+x": (right, along, "<"),
-            "-x": (left, along, ">"),
-            "+y": (along, high, "v"),
-            "-y": (along, low, "^"),
+            "+x": (away, along, "<"),
+            "-x": (-away, along, ">"),
+            "+y": (along, away, "v"),
+            "-y": (along, -away, "^"),
         }[led.side]
         place = np.clip(x, left, right), np.clip(y, low, high)
-        axes.plot(*place, mark, ms=6, color=LED, mec=INK, mew=0.5, clip_on=False, zorder=5)
+        beyond |= place != (x, y)
+        marks += axes.plot(*place, mark, ms=6, color=LED, mec=INK, mew=0.5, clip_on=False, zorder=5)
+    if marks:
+        text = "LED (beyond the edge, at the guide's side)" if beyond else "LED"
+        style: dict[str, Any] = {"fontsize": 6, "frameon": False, "borderaxespad": 0, "handletextpad": 0.2}
+        axes.legend(marks[:1], [text], loc="upper right", bbox_to_anchor=(1.0, -0.14), **style)
 
 
 def _millimetres(axes: Axes, extent: tuple[float, float, float, float]) -> None:
     axes.set_xlim(*extent[:2])
     axes.set_ylim(*extent[2:])
     axes.set_aspect("equal")
+    axes.xaxis.set_major_locator(MaxNLocator(5, steps=ROUND))
+    axes.yaxis.set_major_locator(MaxNLocator(5, steps=ROUND))
     axes.set_xlabel("x, mm")
     axes.set_ylabel("y, mm")

@@ -6,6 +6,8 @@ Drawn with matplotlib's Agg canvas alone: no display, no GPU, no pyplot state. S
 from __future__ import annotations
 
 import io
+import warnings
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -62,7 +64,9 @@ def overview(frame: Pictured, path: str | Path) -> None:
         canvas = FigureCanvasAgg(Figure(figsize=(WIDTH_PX / DPI, HEIGHT_PX / DPI), dpi=DPI))
         draw_sheet(canvas.figure, frame)
         stream = io.BytesIO()
-        canvas.print_png(stream, metadata={"Software": None})  # it would name the version of matplotlib
+        with warnings.catch_warnings():  # a design may have a name that the sheet's type cannot write
+            warnings.filterwarnings("ignore", r"Glyph \d+ .*missing from font", UserWarning)
+            canvas.print_png(stream, metadata={"Software": None})  # it would name the version of matplotlib
     write_bytes(path, stream.getvalue())
 
 
@@ -83,7 +87,7 @@ def draw_sheet(figure: Figure, frame: Pictured) -> None:
 
 
 _TITLE: dict[str, Any] = {"fontsize": 8, "fontweight": "bold", "va": "bottom"}
-_LINE = 0.115  # distance of the tables' lines, as a share of their height
+_LINE = 0.1  # distance of the tables' lines, as a share of their height
 
 
 def _axes(
@@ -107,7 +111,7 @@ def _headline(figure: Figure, frame: Pictured) -> None:
     note = f"design {frame.design.name} · seed {frame.seed} · computed, not photographed"
     place = 30 / WIDTH_PX
     figure.text(place, 1 - 30 / HEIGHT_PX, what, fontsize=12, fontweight="bold", va="center")
-    figure.text(place, 1 - 58 / HEIGHT_PX, note, color=FAINT, va="center")
+    figure.text(place, 1 - 58 / HEIGHT_PX, note, color=FAINT, va="center", parse_math=False)
 
 
 def _scalars(axes: Axes, frame: Pictured, letter: str) -> None:
@@ -130,23 +134,43 @@ def _scalars(axes: Axes, frame: Pictured, letter: str) -> None:
         axes.text(0.62, y, _number(where["raw"][key] * scale), ha="right")
         axes.text(0.84, y, _number(where["tared"][key] * scale), ha="right", fontweight="bold")
         axes.text(0.86, y, unit, color=FAINT)
-    note = "The raw maximum displacement sits at the probe's edge and depends on the mesh."
-    axes.text(0, -0.02, note, fontsize=6, color=FAINT)
+    notes = (
+        "Raw numbers hold the background too (of the picture: all its light and its black level);",
+        "only the tared column is the inclusion.",
+        "The raw maximum displacement sits at the probe's edge and depends on the mesh.",
+    )
+    for i, note in enumerate(notes):
+        axes.text(0, 0.1 - 0.06 * i, note, fontsize=6, color=FAINT)
 
 
 def _facts(axes: Axes, frame: Pictured, letter: str) -> None:
-    fem, tsis = frame.fem, frame.tsis
+    fem, tsis, camera = frame.fem, frame.tsis, frame.design.camera
     _head(axes, f"{letter}  How it was made")
-    facts = (
+    facts = [
         ("indentation", f"{frame.press['indentation_mm']:.3f} mm"),
         ("force", f"{frame.press['force_N']:.4f} N"),
         ("lowest contact pressure", f"{fem['min_pressure_kPa']:.3f} kPa"),
         ("unknowns of the mechanics", _number(fem["dof"])),
-        ("noise of the computed light", f"{tsis['noise_percent']:.2f} %"),
-    )
+        ("LEDs", _coupling(frame)),
+        ("noise of the computed light", f"{tsis['noise_percent']:.2f} % of its mean (rms)"),
+        ("camera exposure", f"{camera.exposure_ms:g} ms"),
+    ]
+    saturated = tsis.get("saturated_percent")
+    if saturated is not None:
+        facts.append(("saturated pixels", f"{saturated:.2f} %"))
     for i, (name, value) in enumerate(facts):
         axes.text(0, 0.73 - _LINE * i, name)
         axes.text(1, 0.73 - _LINE * i, value, ha="right")
+
+
+def _coupling(frame: Pictured) -> str:
+    """How many LEDs shine into the guide which way."""
+    ways = Counter(led.coupling for led in frame.design.leds)
+    names = {"air": "through air", "embedded": "embedded"}
+    if len(ways) == 1:
+        way, count = next(iter(ways.items()))
+        return f"{count}, {names[way]}"
+    return ", ".join(f"{ways[way]} {name}" for way, name in names.items()) if ways else "none"
 
 
 def _head(axes: Axes, title: str) -> None:
