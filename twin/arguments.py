@@ -177,11 +177,19 @@ _REWORDED = (
 )
 
 
+# A word where press levels belong is most likely the design, given too late.
+_LATE_DESIGN = r"(--indentation|--force): received '([^\d'][^']*)';.*"
+
+
 def _plain(message: str) -> str:
     """Return one of argparse's messages in this program's words."""
     message = " ".join(message.split())
     for pattern, words in _REWORDED:
         found = re.fullmatch(pattern, message)
         if found:
-            return found.expand(words)
+            message = found.expand(words)
+            break
+    late = re.fullmatch(_LATE_DESIGN, message)
+    if late and late[2].lower() not in ("nan", "inf") and not late[2].startswith(("-", "+", ".")):
+        message += f" (DESIGN goes first: twin simulate {late[2]} {late[1]} ...)"
     return message

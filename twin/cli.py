@@ -18,10 +18,12 @@ from pathlib import Path
 from types import FrameType
 from typing import NoReturn
 
+from pydantic import TypeAdapter, ValidationError
+
 import fem
 from scenes.backend import BackendError
 from twin.arguments import parse
-from twin.complaint import DesignError
+from twin.complaint import DesignError, from_validation
 from twin.design import Design, design_schema, load_design
 from twin.frame import fill, holds_frames, versions
 from twin.simulate import Options, check, simulate
@@ -46,6 +48,10 @@ _FLAGS = {
 }
 
 
+# Rooms whose own errors are one line for the user.
+_ROOMS = ("fem.", "scenes.", "estimation.", "twin.")
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run the command line and return its exit status."""
     try:
@@ -65,6 +71,12 @@ def main(argv: list[str] | None = None) -> int:
         return 0
     except OSError as error:
         return _fail(name, f"nothing was written: {error}", 1)
+    except MemoryError:
+        return _fail(name, "nothing was written: not enough memory", 1)
+    except ValueError as error:
+        if not type(error).__module__.startswith(_ROOMS):  # a mistake of this program: show where
+            raise
+        return _fail(name, str(error), 1 if isinstance(error.__cause__, OSError) else 2)
 
 
 def _run(arguments: argparse.Namespace) -> int:
@@ -122,11 +134,18 @@ def _inclusion(arguments: argparse.Namespace) -> fem.Inclusion | None:
             raise DesignError(f"--{name}", "nothing", "a finite number > 0 (or --no-inclusion)")
     if arguments.no_inclusion:
         return None
-    return fem.Inclusion(**given, offset=tuple(arguments.offset or (0.0, 0.0)))
+    values = {**given, "offset": tuple(arguments.offset or (0.0, 0.0))}
+    try:
+        return fem.Inclusion(**values)
+    except ValidationError as error:
+        found = from_validation(error, values, TypeAdapter(fem.Inclusion).json_schema())
+        raise found.renamed(f"inclusion.{found.field}") from None
 
 
 def _with_flags(line: str) -> str:
     field, colon, rest = line.partition(":")
+    if field.startswith("inclusion.offset."):
+        field = "inclusion.offset"
     return _FLAGS.get(field, field) + colon + rest
 
 
