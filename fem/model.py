@@ -27,7 +27,7 @@ def _number(value: object) -> float:
     """Refuse the text and the truth values that pydantic would read as numbers; numpy's scalars pass."""
     if isinstance(value, str | bytes | bool) or not hasattr(value, "__float__"):
         raise ValueError("a number")
-    return float(value)  # type: ignore[arg-type]
+    return float(value)
 
 
 _NUMBER = BeforeValidator(_number)

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Any, NoReturn
 
 from twin.complaint import shown
-from twin.simulate import Device, Quality
+from twin.simulation import Device, Quality
 
 QUALITIES = Quality.__args__  # type: ignore[attr-defined]
 DEVICES = Device.__args__  # type: ignore[attr-defined]
