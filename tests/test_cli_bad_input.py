@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+import fem
+from scenes.camera import CameraError
 from twin import cli
 
 TSIS = files("assets").joinpath("designs", "tsis.toml").read_text(encoding="utf-8")
@@ -178,6 +180,26 @@ def test_places_that_cannot_take_the_result(prepare, tmp_path, monkeypatch, capf
     if not (tmp_path / "out").is_symlink():
         kept = tmp_path / "out" if (tmp_path / "out").is_file() else tmp_path / "out" / "thesis.tex"
         assert kept.read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "words"),
+    [
+        (CameraError("radiance: received nan,\nallowed: numbers"), 2, "radiance: received nan, allowed"),
+        (fem.NotModelled("press: received too much"), 2, "press: received too much"),
+        (MemoryError(), 1, "not enough memory"),
+    ],
+)
+def test_failures_on_the_way_are_one_line(error, status, words, tmp_path, monkeypatch, capfd):
+    def fail(*args, **options):
+        raise error
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(cli, "simulate", fail)
+    assert cli.main(FINE) == status
+    printed = capfd.readouterr().err
+    assert len(printed.splitlines()) == 1 and words in printed
+    assert not list(tmp_path.iterdir())
 
 
 def twin(*arguments, folder):
