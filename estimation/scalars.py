@@ -21,8 +21,11 @@ from numpy.typing import ArrayLike
 def scalars(counts: ArrayLike, threshold_dn: float) -> dict[str, float | int]:
     """Return the three scalars of a picture, raw or tared.
 
-    Parameters ---------- counts : (rows, columns) array of counts, of any integer or float type; a tared
-    picture holds negative ones too. threshold_dn : the threshold k in counts, above 0.
+    Parameters
+    ----------
+    counts : (rows, columns) array of counts, of any integer or float type; a tared picture holds negative
+        ones too.
+    threshold_dn : the threshold k in counts, above 0.
 
     Returns
     -------

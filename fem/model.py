@@ -7,14 +7,31 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import ConfigDict, Field
+from pydantic import BeforeValidator, ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 _STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
 
-Length = Annotated[float, Field(gt=0)]
-Modulus = Annotated[float, Field(gt=0, description="Young's modulus, kPa")]
+# Bounds far outside of what a tactile sensor or tissue has, so that only slips (a unit, a power of ten) and
+# what the elements cannot resolve are refused.
+Length = Annotated[float, Field(ge=0.05, le=500)]
+Modulus = Annotated[float, Field(ge=1e-3, le=1e7, description="Young's modulus, kPa")]
 Poisson = Annotated[float, Field(ge=0, le=0.4999, description="Poisson's ratio; up to 0.4999 does not lock")]
+
+MAX_SLENDERNESS = 10.0
+"""Widest slab, in thicknesses: beyond it the elements outside the probe are so long that the force of a 2 mm
+press is off by more than 2 %."""
+
+
+def _number(value: object) -> float:
+    """Refuse the text and the truth values that pydantic would read as numbers; numpy's scalars pass."""
+    if isinstance(value, str | bytes | bool) or not hasattr(value, "__float__"):
+        raise ValueError("a number")
+    return float(value)
+
+
+_NUMBER = BeforeValidator(_number)
+Offset = Annotated[float, Field(ge=-500, le=500), _NUMBER]
 
 
 class NotModelled(ValueError):
@@ -25,7 +42,7 @@ class NotModelled(ValueError):
 class Layer:
     """One elastic layer of the waveguide."""
 
-    thickness_mm: Annotated[float, Field(gt=0, description="thickness, mm")]
+    thickness_mm: Annotated[Length, Field(description="thickness, mm")]
     modulus_kPa: Modulus
     poisson: Poisson = 0.49
 
@@ -34,7 +51,7 @@ class Layer:
 class Probe:
     """Square layered waveguide; `layers` run from the contact side, the last is bonded to rigid glass."""
 
-    width_mm: Annotated[float, Field(gt=0, description="side of the square contact surface, mm")]
+    width_mm: Annotated[Length, Field(description="side of the square contact surface, mm")]
     layers: Annotated[tuple[Layer, ...], Field(min_length=1, description="layers from the contact side")]
 
     @property
@@ -46,10 +63,8 @@ class Probe:
 class Slab:
     """Square tissue slab, sides free, its far face fully fixed to the chest wall at z = thickness."""
 
-    thickness_mm: Annotated[
-        float, Field(gt=0, description="thickness from contact surface to chest wall, mm")
-    ]
-    width_mm: Annotated[float, Field(gt=0, description="side of the square slab, mm")]
+    thickness_mm: Annotated[Length, Field(description="thickness from contact surface to chest wall, mm")]
+    width_mm: Annotated[Length, Field(description="side of the square slab, mm")]
     modulus_kPa: Modulus
     poisson: Poisson = 0.49
 
@@ -62,11 +77,14 @@ class Inclusion:
     inclusion of the source paper would stick out of the tissue). `offset` is inclusion minus probe centre.
     """
 
-    size: Annotated[float, Field(gt=0, description="diameter, mm")]
-    depth: Annotated[float, Field(gt=0, description="depth to the top, mm")]
-    modulus: Modulus
-    offset: Annotated[tuple[float, float], Field(description="inclusion minus probe centre, mm")] = (0.0, 0.0)
-    poisson: Poisson = 0.49
+    size: Annotated[float, Field(ge=0.1, le=500, description="diameter, mm"), _NUMBER]
+    depth: Annotated[float, Field(ge=0.1, le=500, description="depth to the top, mm"), _NUMBER]
+    modulus: Annotated[Modulus, _NUMBER]
+    offset: Annotated[tuple[Offset, Offset], Field(description="inclusion minus probe centre, mm")] = (
+        0.0,
+        0.0,
+    )
+    poisson: Annotated[Poisson, _NUMBER] = 0.49
 
     @property
     def centre_mm(self) -> float:
@@ -80,6 +98,11 @@ def check(probe: Probe, slab: Slab, inclusion: Inclusion | None) -> None:
         raise NotModelled(
             f"probe.width_mm: received {probe.width_mm:g}; not modelled: a probe that overhangs the slab, "
             f"allowed up to slab.width_mm = {slab.width_mm:g}"
+        )
+    if slab.width_mm > MAX_SLENDERNESS * slab.thickness_mm:
+        raise NotModelled(
+            f"slab.width_mm: received {slab.width_mm:g}; not modelled: slabs this much wider than thick, "
+            f"allowed up to {MAX_SLENDERNESS:g} x slab.thickness_mm = {MAX_SLENDERNESS * slab.thickness_mm:g}"
         )
     if inclusion is None:
         return

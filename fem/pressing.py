@@ -19,6 +19,10 @@ Floats = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
 _memory: dict[tuple[object, ...], Solution] = {}  # the last solution: further press levels only scale it
+_TOO_UNEVEN = (
+    "press: received moduli or lengths so far apart that the equations cannot be solved; "
+    "not modelled: allowed are moduli and lengths closer to each other"
+)
 
 
 @dataclass(frozen=True)
@@ -118,8 +122,11 @@ def press(
 
     key = (probe, slab, inclusion, quality)
     if key not in _memory:
-        with one_thread():
-            found = solve(probe, slab, inclusion, res, progress or (lambda stage, fraction: None))
+        try:
+            with one_thread():
+                found = solve(probe, slab, inclusion, res, progress or (lambda stage, fraction: None))
+        except np.linalg.LinAlgError:
+            raise NotModelled(_TOO_UNEVEN) from None
         _memory.clear()
         _memory[key] = found
     solution = _memory[key]
@@ -173,6 +180,8 @@ def _contact(solution: Solution, scales: tuple[float, float], edge: int) -> tupl
     ):
         moved = scale * unit.displacement[sys.tip]
         pressure = surface.pressure(scale * unit.reaction, x, y, edge)
+        if not np.isfinite(pressure).all():
+            raise NotModelled(_TOO_UNEVEN)
         if pressure.min() <= 0:
             i, j = np.unravel_index(int(pressure.argmin()), pressure.shape)
             raise NotModelled(

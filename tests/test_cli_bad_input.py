@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+import fem
+from scenes.camera import CameraError
 from twin import cli
 
 TSIS = files("assets").joinpath("designs", "tsis.toml").read_text(encoding="utf-8")
@@ -58,6 +60,19 @@ FLAGS = {
     ),
     "half an offset": ([*FINE, "--offset", "1"], ["--offset", "number of values", "2"]),
     "inclusion and none": ([*FINE, "--no-inclusion"], ["--size", "--no-inclusion"]),
+    "a tiny inclusion": ([*FINE, "--size", "0.01"], ["--size", "0.01", ">= 0.1"]),
+    "an absurd modulus": ([*FINE, "--modulus", "1e30"], ["--modulus", "1e+30", "<= 1e+07"]),
+    "an absurd offset": ([*FINE, "--offset", "0", "1e9"], ["--offset", "1000000000.0", "<= 500"]),
+    "a tiny force": ([*FINE, "--force", "1e-9"], ["--force", "1e-09", ">= 0.0001"]),
+    "a tiny indentation": ([*FINE, "--indentation", "1e-9"], ["--indentation", "1e-09", ">= 0.0001"]),
+    "a design after the levels": (
+        ["simulate", "--indentation", "1", "2", "tsis", *FINE[1:]],
+        ["--indentation", "'tsis'", "DESIGN goes first", "twin simulate tsis --indentation"],
+    ),
+    "empty out": ([*PRESS, "--out", ""], ["--out", "an empty name", "folder"]),
+    "long out": ([*PRESS, "--out", "o" * 300], ["--out", "folder", "name too long"]),
+    "an out that cannot be": ([*PRESS, "--out", "a\0b"], ["--out", "folder"]),
+    "empty design": (["simulate", "", *FINE[1:]], ["DESIGN", "an empty name", "TOML file"]),
     "unknown design": (["simulate", "tsi", *FINE[1:]], ["DESIGN", "'tsi'", "tsis"]),
     "missing file": (["simulate", "no/such.toml", *FINE[1:]], ["DESIGN", "'no/such.toml'", "TOML file"]),
     "a folder as design": (["simulate", ".", *FINE[1:]], ["DESIGN", "'.'", "a TOML file"]),
@@ -73,7 +88,7 @@ DESIGNS = {
     "wrong type": (mine("columns = 768", 'columns = "768"'), ["camera.columns", "'768'", "an integer"]),
     "negative thickness": (
         mine("thickness_mm = 3.0", "thickness_mm = -3.0"),
-        ["waveguide.layers.1", "-3.0", "> 0"],
+        ["waveguide.layers.1", "-3.0", ">= 0.05"],
     ),
     "index below 1": (
         mine("refractive_index = 1.4336", "refractive_index = 0.9"),
@@ -165,6 +180,26 @@ def test_places_that_cannot_take_the_result(prepare, tmp_path, monkeypatch, capf
     if not (tmp_path / "out").is_symlink():
         kept = tmp_path / "out" if (tmp_path / "out").is_file() else tmp_path / "out" / "thesis.tex"
         assert kept.read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "words"),
+    [
+        (CameraError("radiance: received nan,\nallowed: numbers"), 2, "radiance: received nan, allowed"),
+        (fem.NotModelled("press: received too much"), 2, "press: received too much"),
+        (MemoryError(), 1, "not enough memory"),
+    ],
+)
+def test_failures_on_the_way_are_one_line(error, status, words, tmp_path, monkeypatch, capfd):
+    def fail(*args, **options):
+        raise error
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(cli, "simulate", fail)
+    assert cli.main(FINE) == status
+    printed = capfd.readouterr().err
+    assert len(printed.splitlines()) == 1 and words in printed
+    assert not list(tmp_path.iterdir())
 
 
 def twin(*arguments, folder):

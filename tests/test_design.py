@@ -2,10 +2,12 @@
 
 import dataclasses
 import json
+import re
 import tomllib
 from importlib.resources import files
 
 import jsonschema
+import numpy as np
 import pytest
 
 from fem import Inclusion
@@ -139,19 +141,19 @@ BAD = [
     ("camera.columns", ..., "nothing", "an integer >= 1"),
     ("camera.bits", 7, "7", "an integer >= 8 and <= 16"),
     ("camera.bits", True, "True", "an integer >= 8 and <= 16"),
-    ("camera.pixel_um", [8.4], "nothing", "a number > 0"),
-    ("camera.pixel_um", 8.4, "8.4", "a list of 2, each a number > 0"),
+    ("camera.pixel_um", [8.4], "nothing", "a number >= 0.1 and <= 1000"),
+    ("camera.pixel_um", 8.4, "8.4", "a list of 2, each a number >= 0.1 and <= 1000"),
     ("camera.field_of_view_mm", 26.0, "26.0", "within the guide's 25 mm"),
     ("camera.offset_dn", 255.0, "255.0", "below the 255 counts of 8 bits"),
     ("camera", ..., "nothing", "a table with the keys columns, rows"),
     ("camera", 3, "3", "a table with the keys columns, rows"),
-    ("waveguide.layers.1.thickness_mm", -3.0, "-3.0", "a number > 0"),
+    ("waveguide.layers.1.thickness_mm", -3.0, "-3.0", "a number >= 0.05 and <= 500"),
     ("waveguide.layers.0.poisson", 0.5, "0.5", "a number >= 0 and <= 0.4999"),
     ("waveguide.layers", [], "[]", "a list of 1 to 16"),
     ("waveguide.refractive_index", 0.9, "0.9", "a number >= 1 and <= 4"),
-    ("waveguide.width_mm", float("nan"), "nan", "a finite number > 0"),
-    ("waveguide.width_mm", float("inf"), "inf", "a finite number > 0"),
-    ("waveguide.width_mm", "wide", "'wide'", "a number > 0"),
+    ("waveguide.width_mm", float("nan"), "nan", "a finite number >= 0.05 and <= 500"),
+    ("waveguide.width_mm", float("inf"), "inf", "a finite number >= 0.05 and <= 500"),
+    ("waveguide.width_mm", "wide", "'wide'", "a number >= 0.05 and <= 500"),
     ("leds.2.along_mm", 12.0, "12.0", "-11.75 to 11.75 mm"),
     ("leds.2.along_mm", float("-inf"), "-inf", "a finite number"),
     ("leds.1.z_mm", -0.5, "-0.5", "-9.25 to -0.75 mm"),
@@ -163,11 +165,31 @@ BAD = [
     ("surface.gap_index", 1.5, "1.5", "a number below the guide's index 1.4336"),
     ("specimen.width_mm", 20.0, "20.0", "at least the waveguide's width of 25 mm"),
     ("specimen.albedo", 1.0, "1.0", "a number >= 0 and < 1"),
-    ("press.indentation_mm", [2.0, 7.0], "7.0", "a number > 0 and <= 6 mm"),
-    ("press.indentation_mm", 2.0, "2.0", "a list of 1 or more, each a number > 0"),
-    ("signal.counts", 0, "0", "a number > 0"),
+    ("press.indentation_mm", [2.0, 7.0], "7.0", "a number >= 0.0001 and <= 6 mm"),
+    ("press.indentation_mm", 2.0, "2.0", "a list of 1 to 100, each a number >= 0.0001"),
+    ("signal.counts", 0, "0", "a number >= 0.001 and <= 65535"),
     ("light.wavelength_nm", 200, "200", "a number >= 350 and <= 1100"),
     ("name", 5, "5", "a text in quotes"),
+    ("name", "a\tb", "'a\\tb'", "1 to 100 characters, without control characters"),
+    ("name", "", "''", "1 to 100 characters"),
+    ("waveguide.layers.0.modulus_kPa", 1e8, "100000000.0", "a number >= 0.001 and <= 1e+07"),
+    ("waveguide.layers.0.thickness_mm", 1e-3, "0.001", "a number >= 0.05 and <= 500"),
+    ("specimen.modulus_kPa", 1e-9, "1e-09", "a number >= 0.001 and <= 1e+07"),
+    ("specimen.width_mm", 301.0, "301.0", "at most 10 times its thickness, 300 mm"),
+    ("glass.thickness_mm", 1e300, "1e+300", "a number >= 0.05 and <= 500"),
+    ("leds.0.flux_W", 1e9, "1000000000.0", "a number >= 0 and <= 1000"),
+    ("leds.0.diameter_mm", 1e-5, "1e-05", "a number >= 0.01"),
+    ("leds.0.gap_mm", 1e-9, "1e-09", "a number >= 0.001 and <= 100"),
+    ("camera.distance_mm", 1e-6, "1e-06", "a number >= 1 and <= 10000"),
+    ("camera.f_number", 0.1, "0.1", "a number >= 0.5 and <= 64"),
+    ("camera.exposure_ms", 1e9, "1000000000.0", "a number >= 0.001 and <= 100000"),
+    ("camera.quantum_efficiency", 1e-9, "1e-09", "a number >= 0.001 and <= 1"),
+    ("camera.full_well_e", 1, "1", "a number >= 100 and <= 1e+07"),
+    ("camera.gain_e_per_dn", 1e-9, "1e-09", "a number >= 0.001 and <= 100000"),
+    ("camera.read_noise_e", 1e9, "1000000000.0", "a number >= 0 and <= 10000"),
+    ("camera.dark_current_e_s", 1e9, "1000000000.0", "a number >= 0 and <= 1e+06"),
+    ("surface.rms_slope", 1e-6, "1e-06", "a number >= 0.01 and <= 20"),
+    ("surface.rms_height_um", 1e6, "1000000.0", "a number >= 0.1 and <= 1000"),
 ]
 
 
@@ -196,6 +218,116 @@ def test_embedded_led_stays_in_its_half_of_the_guide(data):
         parse_design(data)
     data["leds"][0]["coupling"] = "air"
     parse_design(data)
+
+
+def test_every_number_of_the_schema_is_bounded():
+    """A slip of the unit or of the power of ten is refused, whichever value it hits."""
+
+    def numbers(node, path=""):
+        if isinstance(node, dict):
+            if node.get("type") in ("number", "integer"):
+                yield path, node
+            for key, child in node.items():
+                yield from numbers(child, f"{path}.{key}")
+        elif isinstance(node, list):
+            for child in node:
+                yield from numbers(child, path)
+
+    found = list(numbers(design_schema()))
+    assert len(found) > 30
+    for path, node in found:
+        assert {"minimum", "exclusiveMinimum"} & set(node), path
+        assert {"maximum", "exclusiveMaximum"} & set(node), path
+
+
+@pytest.mark.parametrize(
+    ("columns", "rows", "allowed"),
+    [
+        (5000, 4000, "at most 3200 with 5000 columns (16 million pixels)"),
+        (2000, 8000, None),
+        (4000, 4000, None),
+    ],
+)
+def test_pictures_fit_the_memory(data, columns, rows, allowed):
+    data["camera"] |= {"columns": columns, "rows": rows, "field_of_view_mm": 3.0}
+    data["leds"].append({"side": "+x", "along_mm": 5.0})
+    line = allowed or f"at most {64_000_000 // 5 // columns} with {columns} columns and 5 LEDs"
+    with pytest.raises(DesignError, match=re.escape(f"camera.rows: received {rows}; allowed {line}")):
+        parse_design(data)
+    data["leds"].pop()
+    if allowed is None:
+        parse_design(data)
+
+
+EMBEDDED = {"coupling": "embedded", "gap_mm": 4.0}
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "cut"),
+    [
+        ({"side": "+x"}, {"side": "+x", "along_mm": 1.4}, True),
+        ({"side": "+x"}, {"side": "+x", "along_mm": 1.5}, False),  # they just touch
+        ({"side": "+x"}, {"side": "+x", "along_mm": 0.9, "z_mm": -6.2}, False),  # 3-4-5: 1.5 mm apart
+        ({"side": "+x"}, {"side": "-x"}, False),
+        ({"side": "+x"}, {"side": "+x", "gap_mm": 1.0}, False),  # one behind the other
+        # Embedded 4 mm deep, the planes meet at x = y = 8.5 mm.
+        ({"side": "+x", "along_mm": 8.0, **EMBEDDED}, {"side": "+y", "along_mm": 8.0, **EMBEDDED}, True),
+        ({"side": "-x", "along_mm": 8.0, **EMBEDDED}, {"side": "+y", "along_mm": -8.0, **EMBEDDED}, True),
+        ({"side": "+x", "along_mm": 8.0, **EMBEDDED}, {"side": "+y", "along_mm": 7.7, **EMBEDDED}, False),
+        ({"side": "+x", "along_mm": 8.0, **EMBEDDED}, {"side": "-y", "along_mm": 8.0, **EMBEDDED}, False),
+        (
+            {"side": "+x", "along_mm": 8.0, **EMBEDDED},
+            {"side": "+y", "along_mm": 8.0, "z_mm": -6.2, **EMBEDDED},
+            False,
+        ),
+    ],
+)
+def test_leds_do_not_cut_each_other(data, one, other, cut):
+    data["leds"] = [one, other]
+    if not cut:
+        parse_design(data)
+        return
+    with pytest.raises(
+        DesignError, match=r"leds\.1: received .*; allowed a place where it does not cut leds\.0"
+    ):
+        parse_design(data)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("a = " + "[" * 20000 + "]" * 20000, "nested too deep"),
+        ("a = " + "9" * 6000, "a number that is too long"),
+        (TSIS.replace("columns = 768", "columns = " + "9" * 4000), "camera.columns"),
+        (TSIS.replace("columns = 768", "columns = " + "9" * 6000), "a number that is too long"),
+        (TSIS.replace("width_mm = 25.0", "width_mm = " + "9" * 4000), "waveguide.width_mm"),
+    ],
+    ids=["nested", "long", "long integer", "very long integer", "long number"],
+)
+def test_monstrous_files_are_one_line(text, words, tmp_path):
+    (tmp_path / "my.toml").write_text(text, encoding="utf-8")
+    with pytest.raises(DesignError) as caught:
+        load_design(tmp_path / "my.toml")
+    assert words in str(caught.value) and len(str(caught.value)) < 400
+
+
+def test_the_mark_of_windows_editors_is_skipped(tmp_path):
+    (tmp_path / "my.toml").write_text(TSIS, encoding="utf-8-sig")
+    assert load_design(tmp_path / "my.toml") == load_design("tsis")
+
+
+def test_what_is_not_an_inclusion_is_named():
+    with pytest.raises(DesignError, match=r"inclusion: received \(10, 5, 100\); allowed a twin\.Inclusion"):
+        load_design("tsis").check_inclusion((10, 5, 100))
+
+
+@pytest.mark.parametrize(
+    "values", [("10", 5, 100), (10, True, 100), (10, 5, None), (0.01, 5, 100), (10, 5, 1e9)]
+)
+def test_inclusions_take_numbers_only(values):
+    with pytest.raises(ValueError):
+        Inclusion(*values)
+    assert Inclusion(np.float32(10), np.int64(5), 100) == Inclusion(10, 5, 100)
 
 
 @pytest.mark.parametrize(

@@ -44,7 +44,7 @@ def test_wheel_holds_every_source_and_asset(wheel: zipfile.ZipFile) -> None:
 
 def test_wheel_names_the_command_and_the_licence(wheel: zipfile.ZipFile) -> None:
     (info,) = {name.split("/")[0] for name in wheel.namelist() if ".dist-info/" in name}
-    assert "twin = twin.cli:main" in wheel.read(f"{info}/entry_points.txt").decode()
+    assert "twin = twin.__main__:main" in wheel.read(f"{info}/entry_points.txt").decode()
     metadata = wheel.read(f"{info}/METADATA").decode()
     assert "Name: tsis-twin" in metadata and "License-Expression: MIT" in metadata
     assert f"{info}/licenses/LICENSE" in wheel.namelist()

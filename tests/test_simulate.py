@@ -164,6 +164,13 @@ def test_progress_runs_from_0_to_1_through_named_stages(design):
         ({"force": 2.0}, "press.force_N"),  # 2 N presses 7 mm deep
         ({"seed": -1}, "seed"),
         ({"seed": 1.5}, "seed"),
+        ({"seed": True}, "seed"),
+        ({"seed": "1"}, "seed"),
+        ({"indentation": True}, "press.indentation_mm"),
+        ({"indentation": "2"}, "press.indentation_mm"),
+        ({"indentation": [1.0, np.True_]}, "press.indentation_mm"),
+        ({"indentation": np.ones((1, 1))}, "press.indentation_mm"),
+        ({"force": 1e-9}, "press.force_N"),
     ],
 )
 def test_impossible_presses_are_refused_in_one_line(design, options, field):
@@ -171,3 +178,32 @@ def test_impossible_presses_are_refused_in_one_line(design, options, field):
         twin.simulate(design, INCLUSION, **{"quality": "preview", **options})
     assert caught.value.field == field
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("indentation", [np.float32(2.0), np.array(2.0), np.int64(2)])
+@pytest.mark.parametrize("seed", [np.uint8(7), np.array(7)])
+def test_numpys_numbers_are_numbers(design, levels, indentation, seed):
+    frame = twin.simulate(design, INCLUSION, indentation, quality="preview", seed=seed)
+    assert isinstance(frame, twin.Frame)
+    assert type(frame.seed) is int
+    assert np.array_equal(frame.image, levels[1].image)
+
+
+def test_full_pixels_are_counted(design, levels):
+    """At a hundred times the exposure every lit pixel is full, at the converter's end or at the well's."""
+    assert levels[1].tsis["saturated_percent"] < 0.1
+    bright = dataclasses.replace(design.camera, exposure_ms=100 * design.camera.exposure_ms)
+    roomy = dataclasses.replace(bright, bits=16)  # no count of 16 bits is reached: the well is full before
+    for camera in (bright, roomy):
+        frame = twin.simulate(dataclasses.replace(design, camera=camera), INCLUSION, 2.0, quality="preview")
+        assert frame.tsis["saturated_percent"] > 90
+    assert frame.image.max() < 2**16 - 1
+
+
+def test_moduli_too_far_apart_for_the_solver_are_refused_in_one_line(design, monkeypatch):
+    def fail(*args):
+        raise np.linalg.LinAlgError("not positive definite")
+
+    monkeypatch.setattr("fem.pressing.solve", fail)
+    with pytest.raises(fem.NotModelled, match="moduli or lengths so far apart"):
+        fem.press(design.probe(), design.slab(), fem.Inclusion(11, 5, 100), 1.0)

@@ -4,6 +4,11 @@ import hashlib
 import json
 import os
 import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,8 +17,10 @@ from test_simulate import INCLUSION, small
 
 import twin
 import twin.cli
-from scenes.exr import read_exr, read_png
+from scenes.exr import read_exr, read_exr_header, read_png
 from twin.frame import FILES, holds_frames, write_frames
+from twin.interrupt import guarded
+from twin.reporting import summarise
 
 FRAME_KEYS = {"inclusion", "press", "fem", "tsis", "design", "seed", "versions", "sha256"}
 RUN = ["simulate", "--size", "10", "--depth", "5", "--modulus", "100", "--out", "out"]
@@ -58,7 +65,7 @@ def test_frame_json_has_exactly_the_promised_keys(frame, folder):
     assert set(record["press"]) == {"indentation_mm", "force_N"}
     assert set(record["fem"]) == {"raw", "tared", "min_pressure_kPa", "dof", "seconds"}
     assert set(record["fem"]["raw"]) == set(record["fem"]["tared"]) == {"max_mm", "total_mm3", "area_mm2"}
-    assert set(record["tsis"]) == {"raw", "tared", "seconds", "noise_percent"}
+    assert set(record["tsis"]) == {"raw", "tared", "seconds", "noise_percent", "saturated_percent"}
     assert set(record["tsis"]["raw"]) == set(record["tsis"]["tared"]) == {"max_dn", "total_dn", "area_px"}
     assert (record["design"], record["seed"]) == ("tsis", 7)
     assert record["tsis"]["tared"] == frame.tsis["tared"]
@@ -137,6 +144,68 @@ def test_an_accident_leaves_nothing_new_behind(
     assert list(tmp_path.iterdir()) == ([out] if earlier else [])
     error = capfd.readouterr().err.strip().splitlines()
     assert "nothing was written" in error[-1] and not any("Traceback" in line for line in error)
+
+
+@pytest.mark.parametrize("delay", [0.3, 0.7, 1.1, 1.5, 2.0, 2.5])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_is_heard_even_while_things_are_imported(number, delay, tmp_path):
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent.parent), "CUDA_VISIBLE_DEVICES": ""}
+    arguments = [sys.executable, "-m", "twin", "demo", "--quality", "reference", "--out", "out"]
+    with subprocess.Popen(
+        arguments, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as run:
+        time.sleep(delay)
+        run.send_signal(number)
+        out, error = run.communicate(timeout=120)
+    assert run.returncode == 130, error
+    assert out == ""
+    assert error.splitlines()[-1].endswith("interrupted; nothing was written")
+    assert "Traceback" not in error and "ignored" not in error
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_interrupt_inside_an_import_is_raised_after_it(tmp_path, monkeypatch):
+    (tmp_path / "slow_to_load.py").write_text(
+        "import os, signal\n"
+        "try:\n    os.kill(os.getpid(), signal.SIGINT); loaded = 'whole'\n"
+        "except BaseException:\n    loaded = 'swallowed'\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    module = None
+    with pytest.raises(KeyboardInterrupt), guarded():
+        import slow_to_load as module
+
+        time.sleep(5)
+    assert module.loaded == "whole"
+
+
+def test_folders_of_killed_runs_go_with_the_next_run(frame, tmp_path, plain_sheet):
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    abandoned, alive = tmp_path / f".out.{gone.pid}.part", tmp_path / f".out.{os.getppid()}.part"
+    others = [alive, tmp_path / f".other.{gone.pid}.part", tmp_path / ".out.mine.part"]
+    for place in (abandoned, *others):
+        (place / "00").mkdir(parents=True)
+    out = frame.write(tmp_path / "out")
+    assert set(tmp_path.iterdir()) == {out, *others}
+
+
+def test_headers_name_the_units(folder):
+    units = read_exr_header(folder / "frame.exr")
+    assert units["unit.led.3"] == "W m-2 sr-1"
+    assert (units["unit.pressure"], units["unit.displacement.z"]) == ("kPa", "mm")
+    assert read_exr_header(folder / "reference.exr")["unit.counts"] == "DN"
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [({}, None), ({"saturated_percent": 3.25}, "saturated: 3.2 %"), ({"dark": True}, "no light reaches")],
+)
+def test_the_last_lines_warn_of_useless_pictures(change, words, frame, tmp_path, capfd):
+    radiance = np.zeros_like(frame.radiance) if change.pop("dark", False) else frame.radiance
+    summarise([replace(frame, tsis={**frame.tsis, **change}, radiance=radiance)], tmp_path)
+    printed = capfd.readouterr().out
+    assert words in printed if words else "saturated" not in printed and "dark" not in printed
 
 
 def test_the_command_line_writes_what_python_returns(frame, tmp_path, monkeypatch, capfd, plain_sheet):

@@ -1,7 +1,23 @@
-"""``python -m twin``."""
+"""``twin`` and ``python -m twin``: listens for Ctrl-C first, and loads the command line then."""
+
+from __future__ import annotations
 
 import sys
 
-from twin.cli import main
+from twin import interrupt
 
-sys.exit(main())
+
+def main() -> int:
+    """Run the command line and return its exit status."""
+    try:
+        with interrupt.guarded():
+            from twin import cli
+
+            return cli.main()
+    except KeyboardInterrupt:  # before or after the command line's own care
+        print("twin: interrupted; nothing was written", file=sys.stderr)
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())

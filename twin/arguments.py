@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Any, NoReturn
 
 from twin.complaint import shown
-from twin.simulate import Device, Quality
+from twin.simulation import Device, Quality
 
 QUALITIES = Quality.__args__  # type: ignore[attr-defined]
 DEVICES = Device.__args__  # type: ignore[attr-defined]
@@ -177,11 +177,19 @@ _REWORDED = (
 )
 
 
+# A word where press levels belong is most likely the design, given too late.
+_LATE_DESIGN = r"(--indentation|--force): received '([^\d'][^']*)';.*"
+
+
 def _plain(message: str) -> str:
     """Return one of argparse's messages in this program's words."""
     message = " ".join(message.split())
     for pattern, words in _REWORDED:
         found = re.fullmatch(pattern, message)
         if found:
-            return found.expand(words)
+            message = found.expand(words)
+            break
+    late = re.fullmatch(_LATE_DESIGN, message)
+    if late and late[2].lower() not in ("nan", "inf") and not late[2].startswith(("-", "+", ".")):
+        message += f" (DESIGN goes first: twin simulate {late[2]} {late[1]} ...)"
     return message

@@ -9,22 +9,20 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import signal
 import sys
-import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
-from types import FrameType
-from typing import NoReturn
+
+from pydantic import TypeAdapter, ValidationError
 
 import fem
 from scenes.backend import BackendError
+from twin import interrupt
 from twin.arguments import parse
-from twin.complaint import DesignError
+from twin.complaint import DesignError, from_validation
 from twin.design import Design, design_schema, load_design
 from twin.frame import fill, holds_frames, versions
-from twin.simulate import Options, check, simulate
+from twin.simulation import Options, check, simulate
 from twin.stage import staged
 
 DEMO_INCLUSION = fem.Inclusion(size=10.0, depth=5.0, modulus=100.0)
@@ -46,6 +44,10 @@ _FLAGS = {
 }
 
 
+# Rooms whose own errors are one line for the user.
+_ROOMS = ("fem.", "scenes.", "estimation.", "twin.")
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run the command line and return its exit status."""
     try:
@@ -54,8 +56,12 @@ def main(argv: list[str] | None = None) -> int:
         return int(stop.code or 0)
     name = f"twin {arguments.verb}" if arguments.verb else "twin"
     try:
-        with _termination_as_interrupt():
-            return _run(arguments)
+        with interrupt.guarded():
+            try:
+                return _run(arguments)
+            except Exception:  # an extension may turn the interrupt that it met into an error of its own
+                interrupt.stop_if_asked()
+                raise
     except (DesignError, fem.NotModelled, BackendError) as error:
         return _fail(name, _with_flags(str(error)), 2)
     except KeyboardInterrupt:
@@ -65,6 +71,12 @@ def main(argv: list[str] | None = None) -> int:
         return 0
     except OSError as error:
         return _fail(name, f"nothing was written: {error}", 1)
+    except MemoryError:
+        return _fail(name, "nothing was written: not enough memory", 1)
+    except ValueError as error:
+        if not type(error).__module__.startswith(_ROOMS):  # a mistake of this program: show where
+            raise
+        return _fail(name, str(error), 1 if isinstance(error.__cause__, OSError) else 2)
 
 
 def _run(arguments: argparse.Namespace) -> int:
@@ -98,18 +110,24 @@ def _simulate(
     from twin.reporting import Reporter, summarise
 
     with staged(arguments.out, holds_frames) as folder, Reporter() as report:
+
+        def tell(stage: str, done: float) -> None:
+            interrupt.stop_if_asked()
+            report(stage, _SIMULATION_SHARE * done)
+
         options = Options(
             quality=arguments.quality,
             seed=arguments.seed,
             device=arguments.device,
-            progress=lambda stage, done: report(stage, _SIMULATION_SHARE * done),
+            progress=tell,
         )
         if by_force:
             frames = simulate(design, inclusion, force=levels, **options)
         else:
             frames = simulate(design, inclusion, levels, **options)
-        report("files", _SIMULATION_SHARE)
+        tell("files", 1.0)
         fill(frames, folder)
+        interrupt.stop_if_asked()
     summarise(frames, Path(arguments.out))
 
 
@@ -122,35 +140,21 @@ def _inclusion(arguments: argparse.Namespace) -> fem.Inclusion | None:
             raise DesignError(f"--{name}", "nothing", "a finite number > 0 (or --no-inclusion)")
     if arguments.no_inclusion:
         return None
-    return fem.Inclusion(**given, offset=tuple(arguments.offset or (0.0, 0.0)))
+    values = {**given, "offset": tuple(arguments.offset or (0.0, 0.0))}
+    try:
+        return fem.Inclusion(**values)
+    except ValidationError as error:
+        found = from_validation(error, values, TypeAdapter(fem.Inclusion).json_schema())
+        raise found.renamed(f"inclusion.{found.field}") from None
 
 
 def _with_flags(line: str) -> str:
     field, colon, rest = line.partition(":")
+    if field.startswith("inclusion.offset."):
+        field = "inclusion.offset"
     return _FLAGS.get(field, field) + colon + rest
 
 
 def _fail(name: str, line: str, status: int) -> int:
     print(f"{name}: {' '.join(line.split())}", file=sys.stderr)
     return status
-
-
-@contextmanager
-def _termination_as_interrupt() -> Iterator[None]:
-    """Treat a request to terminate as Ctrl-C within the block, so that nothing half-written stays."""
-
-    def interrupt(number: int, frame: FrameType | None) -> NoReturn:
-        raise KeyboardInterrupt
-
-    if threading.current_thread() is not threading.main_thread():  # signals do not arrive here anyway
-        yield
-        return
-    earlier = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, earlier)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -158,7 +158,12 @@ def _in_words(schema: Mapping[str, Any], node: Mapping[str, Any] | None) -> str:
             bounds = [f"{sign} {node[key]:g}" for key, sign in _BOUNDS.items() if key in node]
             return " ".join(["a number" if kind == "number" else "an integer", " and ".join(bounds)]).strip()
         case "string":
-            return "a text in quotes"
+            most = f" of 1 to {node['maxLength']} characters" if node.get("minLength") else ""
+            return (
+                f"a text in quotes{most}, without control characters"
+                if "pattern" in node
+                else "a text in quotes"
+            )
         case "array":
             return _list_in_words(schema, node)
         case "object":

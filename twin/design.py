@@ -20,6 +20,7 @@ from pydantic.dataclasses import dataclass
 from pydantic.json_schema import GenerateJsonSchema
 
 import fem
+from fem.model import MAX_SLENDERNESS, Length, Modulus, Poisson
 from scenes.sensor import Camera, Glass, Guide, Led, RefractiveIndex, Sensor, Skin, Tissue, conflicts
 from twin.complaint import DesignError, from_validation, not_finite, shown
 
@@ -29,15 +30,22 @@ MAX_STRAIN = 0.2
 """Deepest press, as a share of the slab's thickness: at 6 mm into 30 mm finite strain changes it by 36 %;
 beyond that nothing here has been compared with an independent code."""
 
-Positive = Annotated[float, Field(gt=0.0)]
-PoissonRatio = Annotated[float, Field(ge=0.0, le=0.4999)]
+MAX_THICKNESS_MM = 500.0
+"""Thickest waveguide, as `scenes.sensor.Guide` has it."""
+
+MIN_INDENTATION_MM = 1e-4
+"""Smallest press: far below what any camera sees."""
+
+_ONE_LINE = r"^[^\x00-\x1f\x7f-\x9f]*$"
+
+Depth = Annotated[float, Field(ge=MIN_INDENTATION_MM, le=100.0)]
 
 
 @dataclass(frozen=True, config=CONFIG)
 class Waveguide:
     """The waveguide: a square, layered block of transparent elastomer, bonded to the glass."""
 
-    width_mm: Annotated[Positive, Field(description="Side of the square contact surface, mm.")]
+    width_mm: Annotated[Length, Field(description="Side of the square contact surface, mm.")]
     layers: Annotated[
         tuple[fem.Layer, ...],
         Field(min_length=1, max_length=16, description="Elastic layers, from the contact side."),
@@ -65,10 +73,10 @@ class Light:
 class Specimen:
     """The tissue: a slab with free sides, fixed to a flat chest wall at its far face."""
 
-    thickness_mm: Annotated[Positive, Field(description="Thickness from contact surface to chest wall, mm.")]
-    width_mm: Annotated[Positive, Field(description="Side of the square slab, mm.")]
-    modulus_kPa: Annotated[Positive, Field(description="Young's modulus of the tissue, kPa.")]
-    poisson: Annotated[PoissonRatio, Field(description="Poisson's ratio of the tissue, up to 0.4999.")] = 0.49
+    thickness_mm: Annotated[Length, Field(description="Thickness from contact surface to chest wall, mm.")]
+    width_mm: Annotated[Length, Field(description="Side of the square slab, mm.")]
+    modulus_kPa: Annotated[Modulus, Field(description="Young's modulus of the tissue, kPa.")]
+    poisson: Annotated[Poisson, Field(description="Poisson's ratio of the tissue, up to 0.4999.")] = 0.49
     refractive_index: Annotated[RefractiveIndex, Field(description="Refractive index of the tissue.")] = 1.40
     albedo: Annotated[
         float,
@@ -85,8 +93,12 @@ class PressDepths:
     """How the sensor is pressed where nothing else is said."""
 
     indentation_mm: Annotated[
-        tuple[Positive, ...],
-        Field(min_length=1, description="Depths that the glass moves towards the chest wall, mm."),
+        tuple[Depth, ...],
+        Field(
+            min_length=1,
+            max_length=100,
+            description="Depths that the glass moves towards the chest wall, mm.",
+        ),
     ] = (2.0,)
 
 
@@ -94,10 +106,12 @@ class PressDepths:
 class Signal:
     """The thresholds k above which a value is signal; fixed here, never chosen per picture."""
 
-    displacement_um: Annotated[Positive, Field(description="Threshold of the surface displacement, µm.")] = (
-        2.0
+    displacement_um: Annotated[
+        float, Field(ge=1e-3, le=1e5, description="Threshold of the surface displacement, µm.")
+    ] = 2.0
+    counts: Annotated[float, Field(ge=1e-3, le=65535.0, description="Threshold of the picture, counts.")] = (
+        10.0
     )
-    counts: Annotated[Positive, Field(description="Threshold of the picture, counts.")] = 10.0
 
 
 @dataclass(frozen=True, config=CONFIG)
@@ -105,7 +119,13 @@ class Design:
     """A tactile sensor, a specimen and a press: everything the twin needs but the inclusion."""
 
     name: Annotated[
-        str, Field(min_length=1, max_length=100, description="Name of the design; it goes with every frame.")
+        str,
+        Field(
+            min_length=1,
+            max_length=100,
+            pattern=_ONE_LINE,
+            description="Name of the design; it goes with every frame.",
+        ),
     ]
     waveguide: Annotated[Waveguide, Field(description="The waveguide: size, index and elastic layers.")]
     leds: Annotated[
@@ -114,7 +134,9 @@ class Design:
     ]
     camera: Annotated[Camera, Field(description="The camera below the glass.")]
     specimen: Annotated[Specimen, Field(description="The tissue slab, without its inclusion.")]
-    description: Annotated[str, Field(max_length=1000, description="One line for people.")] = ""
+    description: Annotated[
+        str, Field(max_length=1000, pattern=_ONE_LINE, description="One line for people.")
+    ] = ""
     light: Annotated[Light, Field(description="What light the LEDs give.")] = Light()
     glass: Annotated[Glass, Field(description="The rigid plate between waveguide and camera.")] = Glass()
     surface: Annotated[Skin, Field(description="The rough contact between waveguide and tissue.")] = Skin()
@@ -171,6 +193,8 @@ class Design:
 
     def check_inclusion(self, inclusion: fem.Inclusion) -> None:
         """Raise `DesignError` if the inclusion leaves the slab or touches the chest wall."""
+        if not isinstance(inclusion, fem.Inclusion):
+            raise DesignError("inclusion", shown(inclusion), "a twin.Inclusion, or None for plain tissue")
         slab, size, depth = self.specimen, inclusion.size, inclusion.depth
         if depth + size >= slab.thickness_mm:
             what = (
@@ -190,13 +214,27 @@ class Design:
 
     def check_indentation(self, indentation: float, field: str = "press.indentation_mm") -> None:
         """Raise `DesignError` if the press is not a depth in mm that the model can be trusted with."""
-        if not 0.0 < indentation <= self.max_indentation_mm:
+        if not MIN_INDENTATION_MM <= indentation <= self.max_indentation_mm:
             raise DesignError(field, shown(indentation), f"{self._depth_in_words()}")
 
     def _depth_in_words(self) -> str:
-        return f"a number > 0 and <= {self.max_indentation_mm:g} mm ({MAX_STRAIN:.0%} of the specimen)"
+        return (
+            f"a number >= {MIN_INDENTATION_MM:g} and <= {self.max_indentation_mm:g} mm "
+            f"({MAX_STRAIN:.0%} of the specimen)"
+        )
 
     def _conflicts(self) -> Iterator[DesignError]:
+        thickness, slab = self.waveguide.thickness_mm, self.specimen
+        if thickness > MAX_THICKNESS_MM:
+            allowed = f"layers of at most {MAX_THICKNESS_MM:g} mm together"
+            yield DesignError("waveguide.layers", f"{thickness:g} mm", allowed)
+            return
+        widest = MAX_SLENDERNESS * slab.thickness_mm
+        if slab.width_mm > widest:
+            allowed = (
+                f"at most {MAX_SLENDERNESS:g} times its thickness, {widest:g} mm (else the mesh is coarse)"
+            )
+            yield DesignError("specimen.width_mm", shown(slab.width_mm), allowed)
         for conflict in conflicts(self.guide(), self.leds, self.camera, self.surface):
             field = conflict.field.replace("skin.", "surface.")
             yield DesignError(field, shown(conflict.received), conflict.allowed)
@@ -247,13 +285,20 @@ def load_design(name_or_path: str | Path) -> Design:
     source = str(name_or_path)
     text = _read(name_or_path)
     try:
-        data = tomllib.loads(text)
+        return parse_design(tomllib.loads(text), source)
     except tomllib.TOMLDecodeError as error:
         message, _, place = str(error).rpartition(" (at ")
         raise DesignError(
             place.rstrip(")") or "the file", f"text that is not TOML ({message})", "TOML", source=source
         ) from None
-    return parse_design(data, source)
+    except RecursionError:
+        raise DesignError(
+            "the file", "lists or tables nested too deep", "a few levels", source=source
+        ) from None
+    except DesignError:
+        raise
+    except ValueError:  # Python reads no integer of thousands of digits
+        raise DesignError("the file", "a number that is too long", "numbers", source=source) from None
 
 
 def parse_design(data: dict[str, Any], source: str = "") -> Design:
@@ -274,11 +319,13 @@ def parse_design(data: dict[str, Any], source: str = "") -> Design:
 
 def _read(name_or_path: str | Path) -> str:
     source = str(name_or_path)
+    if not source:
+        raise DesignError("DESIGN", "an empty name", "a shipped design or a TOML file")
     place: Traversable | Path = Path(source)
     if source in shipped_designs():
         place = files("assets").joinpath("designs", f"{source}.toml")
     try:
-        return place.read_text(encoding="utf-8")
+        return place.read_text(encoding="utf-8-sig")  # Windows editors put a mark first
     except UnicodeDecodeError:
         raise DesignError("the file", "bytes that are not UTF-8 text", "a TOML file", source=source) from None
     except IsADirectoryError:

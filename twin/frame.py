@@ -69,7 +69,7 @@ class Frame:
     fem: dict[str, Any] = field(default_factory=dict)
     """Scalars ``raw`` and ``tared`` of the surface, ``min_pressure_kPa``, ``dof`` and ``seconds``."""
     tsis: dict[str, Any] = field(default_factory=dict)
-    """Scalars ``raw`` and ``tared`` of the picture, ``seconds`` and ``noise_percent``."""
+    """Scalars ``raw`` and ``tared`` of the picture, ``seconds``, ``noise_percent``, ``saturated_percent``."""
 
     @property
     def tared(self) -> NDArray[np.float32]:
@@ -151,8 +151,9 @@ def _write(frame: Frame, folder: Path) -> None:
 
     layers = {f"led.{number}": layer for number, layer in enumerate(frame.radiance)}
     fields = {"pressure": frame.pressure, "displacement.z": frame.displacement_z}
-    write_exr(folder / "frame.exr", {**layers, **fields})
-    write_exr(folder / "reference.exr", {"counts": frame.reference})
+    units = {"pressure": "kPa", "displacement.z": "mm", **dict.fromkeys(layers, "W m-2 sr-1")}
+    write_exr(folder / "frame.exr", {**layers, **fields}, {f"unit.{name}": units[name] for name in units})
+    write_exr(folder / "reference.exr", {"counts": frame.reference}, {"unit.counts": "DN"})
     write_png(folder / "image.png", frame.image)
     write_png(folder / "reference.png", np.rint(frame.reference).astype(frame.image.dtype))
     write_png(folder / "tared.png", tare(frame.image, frame.reference, frame.design.camera.bits))

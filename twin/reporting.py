@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -14,6 +14,9 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from rich.table import Table
 
 from twin.frame import Frame
+
+SATURATED_PERCENT = 0.1
+"""Share of full pixels that is worth a line: fewer do not move the scalars."""
 
 
 class Reporter:
@@ -87,9 +90,21 @@ def summarise(frames: Sequence[Frame], out: Path) -> None:
     console = Console(highlight=False)
     console.print(table)
     console.print("tared: minus the same press without inclusion", soft_wrap=True)
+    for line in _warnings(frames):
+        console.print(line, soft_wrap=True)
     folders = [out] if len(frames) == 1 else [out / f"{number:02d}" for number in range(len(frames))]
     console.print("look at: " + ", ".join(str(folder / "overview.png") for folder in folders), soft_wrap=True)
     console.print(f"all files: {out}", soft_wrap=True)
+
+
+def _warnings(frames: Sequence[Frame]) -> Iterator[str]:
+    """Yield a line for what makes a picture useless: pixels that are full, or no light at all."""
+    worst = max(frame.tsis.get("saturated_percent", 0.0) for frame in frames)
+    if worst > SATURATED_PERCENT:
+        where = "" if len(frames) == 1 else " of the brightest frame"
+        yield f"saturated: {worst:.1f} % of the pixels{where}; a shorter camera.exposure_ms avoids it"
+    if not all(frame.radiance.any() for frame in frames):
+        yield "dark: no light reaches the camera; see flux_W of the leds"
 
 
 def _title(frame: Frame) -> str:

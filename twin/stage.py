@@ -6,6 +6,7 @@ Ctrl-C leaves neither half a result nor a broken earlier one.
 
 from __future__ import annotations
 
+import glob
 import os
 import shutil
 from collections.abc import Callable, Iterator
@@ -23,14 +24,17 @@ def staged(out: str | Path, is_ours: Callable[[Path], bool]) -> Iterator[Path]:
     decides; that is then replaced. Anything else is refused with a `DesignError`, as is a place that cannot
     be written.
     """
+    if not str(out):
+        raise DesignError("out", "an empty name", "the folder to make for the results")
     target = Path(os.path.abspath(out))
     _refuse_foreign(out, target, is_ours)
     made: list[Path] = []
     try:
         made = _make_parents(target.parent)
+        _remove_abandoned(target)
         folder = target.with_name(f".{target.name}.{os.getpid()}.part")
         folder.mkdir()
-    except OSError as error:
+    except (OSError, ValueError) as error:
         _remove_empty(made)
         raise DesignError("out", shown(str(out)), f"a folder that can be made ({_reason(error)})") from None
     try:
@@ -44,14 +48,34 @@ def staged(out: str | Path, is_ours: Callable[[Path], bool]) -> Iterator[Path]:
 
 def _refuse_foreign(out: str | Path, target: Path, is_ours: Callable[[Path], bool]) -> None:
     allowed = "a new or empty folder, or one that holds an earlier result of twin and nothing else"
-    if target.is_symlink() or (target.exists() and not target.is_dir()):
-        raise DesignError("out", f"{shown(str(out))}, which is not a folder", allowed)
     try:
+        if target.is_symlink() or (target.exists() and not target.is_dir()):
+            raise DesignError("out", f"{shown(str(out))}, which is not a folder", allowed)
         foreign = target.is_dir() and any(target.iterdir()) and not is_ours(target)
     except OSError as error:
         raise DesignError("out", shown(str(out)), f"a folder that can be read ({_reason(error)})") from None
     if foreign or target == target.parent:
         raise DesignError("out", f"{shown(str(out))}, which holds something else", allowed)
+
+
+def _remove_abandoned(target: Path) -> None:
+    """Remove what earlier runs towards the same folder left when they were killed outright."""
+    for place in target.parent.glob(f".{glob.escape(target.name)}.*.part"):
+        pid = place.name.removeprefix(f".{target.name}.").removesuffix(".part")
+        if pid.isdecimal() and place.is_dir() and not place.is_symlink() and not _lives(int(pid)):
+            shutil.rmtree(place, ignore_errors=True)
+
+
+def _lives(pid: int) -> bool:
+    if pid == os.getpid():  # the number of a process that is gone; this one has no such folder yet
+        return False
+    try:
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:  # somebody else's
+        return True
+    return True
 
 
 def _make_parents(parent: Path) -> list[Path]:
@@ -91,5 +115,5 @@ def _swap(folder: Path, target: Path) -> None:
     shutil.rmtree(earlier, ignore_errors=True)
 
 
-def _reason(error: OSError) -> str:
-    return (error.strerror or "the system refuses it").lower()
+def _reason(error: OSError | ValueError) -> str:
+    return (getattr(error, "strerror", None) or "the system refuses it").lower()

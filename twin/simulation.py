@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import operator
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, TypedDict, Unpack, overload
+from typing import TYPE_CHECKING, Literal, SupportsIndex, TypedDict, Unpack, overload
 
 import numpy as np
 
@@ -25,6 +26,9 @@ Quality = Literal["preview", "standard", "reference"]
 Device = Literal["auto", "cpu", "cuda"]
 Progress = Callable[[str, float], None]
 """Called with the name of the stage that runs now and the share of all work that is done, 0 to 1."""
+
+MIN_FORCE_N = 1e-4
+"""Smallest press by force: far below what any camera sees."""
 
 REFERENCE_FRAMES = 16
 """Noisy frames whose mean is the camera's reference."""
@@ -53,7 +57,7 @@ class Options(TypedDict, total=False):
     """What `simulate` takes beside the press, for whichever form of it."""
 
     quality: Quality
-    seed: int
+    seed: SupportsIndex
     device: Device
     progress: Progress | None
 
@@ -89,7 +93,7 @@ def simulate(
     *,
     force: float | Sequence[float] | None = None,
     quality: Quality = "standard",
-    seed: int = 0,
+    seed: SupportsIndex = 0,
     device: Device = "auto",
     progress: Progress | None = None,
 ) -> Frame | list[Frame]:
@@ -113,8 +117,7 @@ def simulate(
     design = design if isinstance(design, Design) else load_design(design)
     levels, by_force, several = _levels(design, indentation, force)
     check(design, inclusion, levels, by_force=by_force)
-    if not isinstance(seed, int) or isinstance(seed, bool) or seed < 0:
-        raise DesignError("seed", shown(seed), "an integer >= 0")
+    seed = _seed(seed)
     from scenes import Renderer
 
     renderer = Renderer(design.sensor(), device=device)
@@ -156,8 +159,18 @@ def check(
     for level in levels:
         if not by_force:
             design.check_indentation(level)
-        elif not 0.0 < level < np.inf:
-            raise DesignError("press.force_N", shown(level), "a finite number > 0")
+        elif not MIN_FORCE_N <= level < np.inf:
+            raise DesignError("press.force_N", shown(level), f"a finite number >= {MIN_FORCE_N:g} N")
+
+
+def _seed(seed: SupportsIndex) -> int:
+    """Return any kind of integer, numpy's too, as Python's own."""
+    try:
+        if isinstance(seed, bool) or operator.index(seed) < 0:
+            raise TypeError
+    except TypeError:
+        raise DesignError("seed", shown(seed), "an integer >= 0") from None
+    return operator.index(seed)
 
 
 def _levels(
@@ -169,10 +182,15 @@ def _levels(
     given = force if force is not None else indentation
     if given is None:
         given = design.press.indentation_mm[0]
-    several = isinstance(given, Sequence | np.ndarray)
+    several = isinstance(given, Sequence) or np.ndim(given) > 0
     field = "press.force_N" if force is not None else "press.indentation_mm"
     try:
-        levels = [float(level) for level in given] if several else [float(given)]  # type: ignore[union-attr, arg-type]
+        each = list(given) if several else [given]  # type: ignore[arg-type]
+        if isinstance(given, str | bytes) or any(isinstance(level, bool | np.bool_ | str) for level in each):
+            raise TypeError
+        if any(np.ndim(level) for level in each):
+            raise TypeError
+        levels = [float(level) for level in each]  # type: ignore[arg-type]
     except (TypeError, ValueError):
         raise DesignError(field, shown(given), "a number > 0, or a list of them") from None
     if not levels:
@@ -250,8 +268,23 @@ def _frame(
             "tared": scalars(image.astype(np.float64) - reference, k),
             "seconds": time.perf_counter() - start,
             "noise_percent": lit.noise_percent,
+            "saturated_percent": _saturated_percent(design, image, lit.radiance),
         },
     )
+
+
+def _saturated_percent(design: Design, image: np.ndarray, radiance: np.ndarray) -> float:
+    """Return the share of pixels at the converter's last count or at the full well, per cent.
+
+    ``image`` is (rows, columns) counts, ``radiance`` (n_led, rows, columns) W m⁻² sr⁻¹.
+    """
+    from scenes.camera import mean_counts
+
+    camera = design.camera
+    well = camera.offset_dn + camera.full_well_e / camera.gain_e_per_dn
+    mean = mean_counts(camera, radiance.sum(axis=0, dtype=np.float64), design.light.wavelength_nm)
+    full = (image >= 2**camera.bits - 1) | (mean >= well * (1 - 1e-12))
+    return 100.0 * float(full.mean())
 
 
 def _random(seed: int, *purpose: int) -> np.random.SeedSequence:
