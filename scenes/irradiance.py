@@ -99,7 +99,6 @@ def refine(irradiance: Array, factor: int) -> Array:
 
 
 def _along_both(step: Array, irradiance: Array) -> Array:
-    # einsum, not matmul: its order of summation does not depend on the number of threads
     return np.einsum("yi,...ij,xj->...yx", step, irradiance, step, optimize=["einsum_path", (0, 1), (0, 1)])
 
 

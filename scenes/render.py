@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from . import backend, surface, view
-from .sensor import Sensor
+from .sensor import NotModelled, Sensor
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -117,11 +117,22 @@ class Renderer:
         if quality == "reference":
             radiance, noise = self._reference(samples or REFERENCE_SAMPLES, seed, tell)
         else:
+            self._check_leds(shape)
             radiance, noise = self._traced(shape, sight, samples or PATHS_PER_LED[quality], seed, tell)
         pressure, displacement_z = surface.at(shape, sight.position_mm)
         return Rendering(
             radiance, sight.position_mm, pressure, displacement_z, noise, time.perf_counter() - start
         )
+
+    def _check_leds(self, shape: surface.OpticalSurface) -> None:
+        """Refuse LEDs that the deformed rim would shade: the gathered light knows no shade."""
+        lowest = float(shape.displacement_mm[..., 2].min())
+        for number, led in enumerate(self.sensor.leds):
+            if led.z_mm + led.diameter_mm / 2 > lowest:
+                allowed = (
+                    f"at most {lowest - led.diameter_mm / 2:.3g} mm under this press, below the pressed rim"
+                )
+                raise NotModelled(f"leds.{number}.z_mm: received {led.z_mm:g}; allowed {allowed}")
 
     def _traced(
         self,
@@ -146,9 +157,12 @@ class Renderer:
                 max(samples // passes, 2),
                 seed * _MOST_PASSES + number,
             )
-            runs.append(gather.picture(sight, self.basis, straight + irradiance.smooth(landed)))
+            with threadpool_limits(1):
+                light = straight + irradiance.smooth(landed)
+            runs.append(gather.picture(sight, self.basis, light))
             tell((number + 1) / passes)
-        radiance = np.asarray(np.mean(runs, axis=0, dtype=np.float64))
+        # the smoothing kernel has negative sides: next to an edge of light they may undershoot the dark
+        radiance = np.maximum(np.mean(runs, axis=0, dtype=np.float64), 0.0)
         totals = np.sum(runs, axis=1, dtype=np.float64)
         spread = np.std(totals, axis=0, ddof=1) / np.sqrt(passes)
         relative = np.sqrt(np.mean(spread**2)) / max(np.mean(totals), 1e-30)

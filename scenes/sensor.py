@@ -25,6 +25,10 @@ Side = Literal["+x", "-x", "+y", "-y"]
 Coupling = Literal["air", "embedded"]
 
 
+class NotModelled(ValueError):
+    """A sensor or a press that the optics cannot show rightly yet; the message is one line."""
+
+
 class Conflict(NamedTuple):
     """A value that does not fit the others: dotted field, what it holds, what would be allowed."""
 

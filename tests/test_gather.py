@@ -1,9 +1,11 @@
 """What the camera gathers, where a pixel's ray could go astray or meets an LED."""
 
 import dataclasses
+from typing import Literal
 
 import numpy as np
-from sensors import bump, paper_sensor
+import pytest
+from sensors import bump, paper_sensor, pressed
 
 
 def test_square_pixels_see_the_surface_everywhere(variant: str) -> None:
@@ -14,6 +16,33 @@ def test_square_pixels_see_the_surface_everywhere(variant: str) -> None:
     seen = Renderer(square, "cpu").render(bump(), quality="preview", samples=2**12)
     assert seen.pressure.min() > 0.85
     assert seen.radiance.sum(axis=0).min() > 0.0
+
+
+@pytest.mark.parametrize(("along", "z"), [(11.75, -1.0), (0.0, -0.9), (-11.0, -9.0)])
+@pytest.mark.parametrize("coupling", ["air", "embedded"])
+def test_no_light_is_negative(
+    variant: str, coupling: Literal["air", "embedded"], along: float, z: float
+) -> None:
+    """One LED leaves most of the picture dark, where the smoothing kernel's negative sides could show."""
+    from scenes import Renderer
+
+    base = paper_sensor(coupling, columns=96, rows=64, pixel_um=(67.0, 75.0))
+    led = dataclasses.replace(base.leds[0], along_mm=along, z_mm=z)
+    one = Renderer(dataclasses.replace(base, leds=(led,)), "cpu")
+    radiance = one.render(bump(), quality="preview", samples=2**14).radiance
+    assert radiance.min() >= 0.0
+    assert radiance.max() > 0.0
+
+
+def test_led_above_the_pressed_rim_is_refused(variant: str) -> None:
+    from scenes import Renderer
+    from scenes.sensor import NotModelled
+
+    base = paper_sensor(columns=96, rows=64, pixel_um=(67.0, 75.0))
+    high = dataclasses.replace(base.leds[0], z_mm=-0.76)
+    low_rim = pressed(lambda x, y: 0.9, lambda x, y: (0.0, 0.0, -0.3 * (abs(x) > 12.0)))
+    with pytest.raises(NotModelled, match=r"leds\.0\.z_mm: received -0.76; allowed at most"):
+        Renderer(dataclasses.replace(base, leds=(high,)), "cpu").render(low_rim, samples=2**12)
 
 
 def test_led_in_sight_and_its_mirror_image_are_as_path_sees_them(variant: str) -> None:

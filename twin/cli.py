@@ -17,6 +17,7 @@ from pydantic import TypeAdapter, ValidationError
 
 import fem
 from scenes.backend import BackendError
+from scenes.sensor import NotModelled
 from twin import interrupt
 from twin.arguments import parse
 from twin.complaint import DesignError, from_validation
@@ -62,7 +63,7 @@ def main(argv: list[str] | None = None) -> int:
             except Exception:  # an extension may turn the interrupt that it met into an error of its own
                 interrupt.stop_if_asked()
                 raise
-    except (DesignError, fem.NotModelled, BackendError) as error:
+    except (DesignError, fem.NotModelled, NotModelled, BackendError) as error:
         return _fail(name, _with_flags(str(error)), 2)
     except KeyboardInterrupt:
         return _fail(name, "interrupted; nothing was written", 130)
