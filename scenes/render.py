@@ -144,7 +144,8 @@ class Renderer:
     ) -> tuple[NDArray[np.float32], float]:
         from . import direct, gather, irradiance, trace
 
-        straight = direct.direct(self.sensor, self.basis, shape)
+        with threadpool_limits(1):
+            straight = direct.direct(self.sensor, self.basis, shape)
         passes = max(2, -(-samples // _PATHS_PER_PASS))
         runs = []
         for number in range(passes):
