@@ -230,6 +230,11 @@ class Factor:
                 x += self._substitute(load - apply(self.tree, self.matrices, x))
             return x
 
+    def precondition(self, load: Floats) -> Floats:
+        """One substitution, without refinement; both shape (unknowns,)."""
+        with one_thread():
+            return self._substitute(load)
+
     def _substitute(self, load: Floats) -> Floats:
         x = np.empty(self.tree.size)
         x[self.tree.order] = load

@@ -1,0 +1,268 @@
+"""Equilibrium of probe and slab: Newton's method on the forces, conjugate gradients on the tangent, active set.
+
+The tangent is applied element by element and never assembled; a Cholesky factor of an earlier tangent
+(`fem.solver`) preconditions it, so that most Newton steps need no factorisation at all. Which pairs of contact
+nodes are closed is iterated around it (primal-dual active set: Hüeber and Wohlmuth 2005; [hueber2005]): closed pairs
+that pull are opened, open pairs that overlap are closed, until neither is left.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse.linalg import LinearOperator, cg
+
+from fem import contact, elasticity, solver
+from fem.contact import Interface, Slip
+from fem.elasticity import Inverted
+from fem.quadrature import DOFS, Quadrature
+from fem.system import Nodes, System, system
+from fem.topology import Layout
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+_TOLERANCE = 1e-10  # of the residual, relative to the reaction at the chest wall
+_FORCING = 1e-3  # to which conjugate gradients solve each Newton step
+_NEWTON = 25  # steps at most
+_PATIENCE = 7  # steps after which the residual must have come down to a hundredth of the reaction
+_WORTH = 30  # iterations of conjugate gradients that are worth a new factor
+DEBUG = False
+SLIDE = True
+_SETS = 40  # changes of the active set at most
+
+
+class NotConverged(ArithmeticError):
+    """Newton's method or the active set found no equilibrium in this step."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """Probe and slab in real coordinates, without the moduli of the slab's contents."""
+
+    layout: Layout
+    sides: str
+    nodes: Nodes
+    interface: Interface
+    quad: Quadrature
+    place: Floats  # undeformed nodes, (nodes, 3) mm
+    shift: Floats  # of the slab's nodes under the probe's, within the slab's surface, (nx, ny, 2) mm
+    normal: Floats  # direction of the press in the probe's frame, (3,)
+    ball: NDArray[np.int64]  # elements of the inclusion
+    finite: bool  # finite strain with sliding contact, or linear elasticity
+
+    def chest(self, indentation: float) -> Floats:
+        """Displacements that are held, (nodes, 3) mm: the chest wall comes nearer by the indentation."""
+        moved = np.zeros_like(self.place)
+        moved[self.nodes.chest] = -indentation * self.normal
+        return moved
+
+    def system(self, closed: Bools) -> System:
+        return system(self.layout, self.sides, closed)
+
+    def settle(self, moved: Floats, closed: Bools, guess: Slip | None) -> Slip | None:
+        """Put the probe's closed nodes onto the slab's surface, in place; small strain leaves out the slip."""
+        if self.finite:
+            return contact.settle(self.interface, self.place, moved, closed, guess)
+        tip = self.nodes.tip
+        moved[tip, 2] = np.where(closed, moved[tip, 2] + self.gap(moved, None), moved[tip, 2])
+        return None
+
+    def gap(self, moved: Floats, found: Slip | None) -> Floats:
+        """Distance along z between the surfaces at the probe's nodes, (nx, ny) mm; negative where they
+        overlap."""
+        place = self.place + moved
+        height = place[self.nodes.contact, 2] if found is None else found.height
+        return np.asarray(height - place[self.nodes.tip, 2])
+
+    def nodal(self, forces: Floats) -> Floats:
+        """Sum of element forces (m, 27, 3) at the nodes, (nodes, 3)."""
+        dofs = (3 * self.nodes.cells[:, :, None] + np.arange(3)).ravel()
+        total = np.bincount(dofs, weights=forces.ravel(), minlength=self.place.size)
+        return np.asarray(total, dtype=float).reshape(-1, 3)
+
+
+@dataclass(frozen=True)
+class State:
+    """One equilibrium."""
+
+    indentation: float  # mm
+    moved: Floats  # displacement of the nodes in the probe's frame, (nodes, 3) mm
+    closed: Bools  # pairs in contact, (nx, ny)
+    force: Floats  # of the probe on the slab along z at each pair, mN, positive pressing; (nx, ny)
+    chest: Floats  # of the slab on the chest wall, (3,) mN
+    model: Model  # the mesh it belongs to
+    slip: Slip | None = None
+
+
+@dataclass
+class Effort:
+    """What finding the equilibria took."""
+
+    factors: int = 0
+    newton: int = 0
+    cg: int = 0
+    sets: int = 0
+
+
+@dataclass
+class Body:
+    """All moduli, and the factors found so far."""
+
+    shear: Floats
+    bulk: Floats
+    rest: NDArray[np.floating]  # stiffness of the undeformed elements, (m, 81, 81)
+    factors: dict[bytes, solver.Factor] = field(default_factory=dict)
+    effort: Effort = field(default_factory=Effort)
+
+    def forces(self, model: Model, moved: Floats) -> Floats:
+        """Internal forces (nodes, 3), mN."""
+        if model.finite:
+            return model.nodal(elasticity.forces(model.quad, moved, self.shear, self.bulk))
+        return model.nodal(product(self.rest, moved, model))
+
+    def tangent(self, model: Model, moved: Floats) -> NDArray[np.floating]:
+        """Tangent stiffness of the elements, (m, 81, 81)."""
+        if not model.finite:
+            return self.rest
+        return elasticity.stiffness(model.quad, self.shear, self.bulk, moved, dtype=self.rest.dtype)
+
+    def factor(self, sys: System, matrices: NDArray[np.floating], renew: bool = False) -> solver.Factor:
+        """Factor of the tied stiffness for a set of closed pairs; an old one serves unless renewed."""
+        key = sys.closed.tobytes()
+        if renew or key not in self.factors:
+            self.factors.clear()
+            self.factors[key] = solver.Factor(sys.tree, matrices)
+            self.effort.factors += 1
+        return self.factors[key]
+
+
+def product(matrices: NDArray[np.floating], moved: Floats, model: Model) -> Floats:
+    """Forces (m, 27, 3) of element matrices on displacements (nodes, 3)."""
+    local = moved[model.nodes.cells].reshape(-1, DOFS, 1)
+    return np.asarray(matrices @ local.astype(matrices.dtype), dtype=float).reshape(-1, 27, 3)
+
+
+def equilibrium(body: Body, guess: State) -> State:
+    """Find the equilibrium at `guess.indentation`, from its displacements and its closed pairs.
+
+    Raises
+    ------
+    NotConverged, Inverted
+        The step was too long.
+    """
+    model, state = guess.model, replace(guess, moved=guess.moved.copy())
+    held = model.nodes.held
+    state.moved[held] = np.where(held, model.chest(guess.indentation), 0.0)[held]
+    seen: set[bytes] = set()
+    for turn in range(_SETS):
+        state = _newton(body, state)
+        distance = model.gap(state.moved, state.slip)
+        pulls = state.closed & (state.force < 0)
+        overlaps = ~state.closed & (distance < 0)
+        if not (pulls.any() or overlaps.any()):
+            return state
+        closed = (state.closed & ~pulls) | overlaps
+        key = closed.tobytes()
+        if key in seen:  # going round in circles: change one pair at a time, the worst
+            closed = state.closed.copy()
+            worst = np.where(pulls, state.force / np.abs(state.force).max(initial=1e-300), 0.0)
+            worst = np.where(overlaps, distance / np.abs(distance).max(), worst)
+            at = np.unravel_index(int(worst.argmin()), worst.shape)
+            closed[at] = ~closed[at]
+            key = closed.tobytes()
+        seen.add(key)
+        state = replace(state, closed=closed)
+        body.effort.sets += 1
+    raise NotConverged("the set of closed contact pairs does not settle")
+
+
+def _newton(body: Body, start: State) -> State:
+    """Equilibrium for a given set of closed pairs."""
+    model, closed, moved = start.model, start.closed, start.moved
+    sys = model.system(closed)
+    tip, at_chest = model.nodes.tip, model.nodes.chest
+    matrices: NDArray[np.floating] | None = None
+    last = np.inf
+    renew, found = False, None
+    for turn in range(_NEWTON):
+        found = model.settle(moved, closed, found)
+        forces = body.forces(model, moved)
+        normal = np.where(closed, forces[tip, 2], 0.0)
+        residual = sys.gather(_reduce(found, forces, normal, tip))
+        size, scale = float(np.linalg.norm(residual)), float(np.linalg.norm(forces[at_chest]))
+        if size <= _TOLERANCE * scale or scale == 0.0:
+            return replace(start, moved=moved, force=-normal, chest=-forces[at_chest].sum(axis=0), slip=found)
+        if DEBUG: print("      it", size/scale, closed.mean(), body.effort.cg)
+        if not np.isfinite(size) or size > 1e2 * last or (turn >= _PATIENCE and size > 1e-2 * scale):
+            raise NotConverged("the residual grows")
+        last = size
+        matrices = body.tangent(model, moved)
+        factor = body.factor(sys, matrices, renew)
+        change, steps = _solve(body, model, sys, found, matrices, factor, normal, -residual)
+        renew = model.finite and steps > _WORTH
+        moved = moved + change
+        body.effort.newton += 1
+    raise NotConverged("Newton's method does not converge")
+
+
+def _reduce(found: Slip | None, forces: Floats, normal: Floats, tip: NDArray[np.int64]) -> Floats:
+    """Hand the closed probe nodes' normal forces (nx, ny) on to where they stand; all forces (nodes, 3)."""
+    if found is None:
+        return forces
+    out = forces.copy()
+    out[tip, 2] -= normal
+    found.push(normal, out)
+    return out
+
+
+def _solve(
+    body: Body,
+    model: Model,
+    sys: System,
+    found: Slip | None,
+    matrices: NDArray[np.floating],
+    factor: solver.Factor,
+    normal: Floats,
+    load: Floats,
+) -> tuple[Floats, int]:
+    """Change of the displacements (nodes, 3) that a load on the unknowns makes, and the iterations taken."""
+    tip = model.nodes.tip
+
+    def expand(values: Floats) -> Floats:
+        change = sys.expand(values)
+        if found is not None:
+            change[tip, 2] = np.where(sys.closed, found.moved(change), change[tip, 2])
+        return change
+
+    if not model.finite:
+        return expand(factor.solve(load)), 1
+
+    def apply(values: Floats) -> Floats:
+        change = expand(values)
+        force = model.nodal(product(matrices, change, model))
+        if found is not None:
+            force = _reduce(found, force, np.where(sys.closed, force[tip, 2], 0.0), tip)
+            found.stiffen(change, normal, force)
+        return sys.gather(force)
+
+    count = [0]
+
+    def tick(_: Floats) -> None:
+        count[0] += 1
+
+    shape = (len(load), len(load))
+    answer, failed = cg(
+        LinearOperator(shape, matvec=apply, dtype=float),
+        load,
+        rtol=_FORCING,
+        maxiter=200,
+        M=LinearOperator(shape, matvec=factor.precondition, dtype=float),
+        callback=tick,
+    )
+    body.effort.cg += count[0]
+    if failed:
+        raise NotConverged("the tangent is not positive definite")
+    return expand(answer), count[0]

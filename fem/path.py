@@ -1,0 +1,225 @@
+"""Follow a press: from the first touch through all press levels, with steps that cut themselves back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fem import contact, elasticity, mesh, solver
+from fem.contact import Interface, line
+from fem.elasticity import Inverted
+from fem.equilibrium import Body, Model, NotConverged, State, equilibrium, product
+from fem.mesh import Geometry
+from fem.quadrature import Quadrature, join, quadrature
+from fem.system import nodes
+from fem.topology import Resolution, materials
+
+Floats = NDArray[np.float64]
+
+_LONGEST = 1.0  # mm of indentation in one step
+_CUTS = 9  # halvings of a step at most
+_STRAY = 0.02  # mm that a pair of contact nodes may slide apart before the mesh follows
+
+
+def build(geometry: Geometry, res: Resolution, finite: bool, shift: Floats | None = None) -> Model:
+    """Mesh a geometry; `shift` as in `mesh.morph_slab`."""
+    layout = geometry.layout(res)
+    slab, probe = mesh.morph_slab(layout, geometry, shift), mesh.morph_probe(layout, geometry)
+    found = nodes(layout, geometry.slab.sides)
+    place = np.hstack([slab.doflocs, probe.doflocs]).T
+    x, y = place[found.tip[:, 0], 0], place[found.tip[0], 1]
+    return Model(
+        layout,
+        geometry.slab.sides,
+        found,
+        Interface(found.contact, found.tip, line(x, layout.symmetric[0]), line(y, layout.symmetric[1])),
+        join([quadrature(slab), quadrature(probe)]),
+        place,
+        np.zeros((*found.tip.shape, 2)) if shift is None else shift,
+        mesh.rotation(geometry.pose.tilt_deg).T[:, 2],
+        np.flatnonzero(materials(layout) == 1),
+        finite,
+    )
+
+
+def follow(geometry: Geometry, model: Model, shift: Floats) -> Model:
+    """The same model with the slab's contact nodes moved within its surface, to where the probe's nodes are."""
+    slab = mesh.morph_slab(model.layout, geometry, shift)
+    quad, place, cut = quadrature(slab), model.place.copy(), model.nodes.slab_cells
+    place[: model.nodes.slab] = slab.doflocs.T
+    both = Quadrature(
+        model.quad.nodes,
+        *(
+            np.concatenate([getattr(quad, name), getattr(model.quad, name)[cut:]])
+            for name in ("inverse", "weight", "modes")
+        ),
+    )
+    return replace(model, quad=both, place=place, shift=shift)
+
+
+def moduli(geometry: Geometry, model: Model, inclusion: bool) -> tuple[Floats, Floats]:
+    """Shear and bulk modulus of each element, kPa; the slab's own in place of the inclusion if it is left
+    out."""
+    probe, slab = geometry.probe, geometry.slab
+    inner = geometry.inclusion if inclusion and geometry.inclusion is not None else None
+    ball = (slab.modulus_kPa, slab.poisson) if inner is None else (inner.modulus, inner.poisson)
+    table = [(slab.modulus_kPa, slab.poisson), ball, *((la.modulus_kPa, la.poisson) for la in probe.layers)]
+    modulus, poisson = np.array(table).T[:, materials(model.layout)]
+    return elasticity.lame(modulus, poisson)
+
+
+@dataclass
+class Path:
+    """Equilibria of one body, found one after the other."""
+
+    geometry: Geometry
+    body: Body
+    states: list[State]
+    beside: Path | None = None
+    """The same press without inclusion: its states are where to begin, and give the mesh."""
+
+    def to(self, indentation: float) -> State:
+        """Equilibrium at an indentation, mm.
+
+        Raises
+        ------
+        NotConverged
+            If even the shortest step fails.
+        """
+        if self.beside is not None:
+            try:
+                other = self.beside.to(indentation)
+                self.states.append(equilibrium(self.body, self._aside(other)))
+                return self.states[-1]
+            except (NotConverged, Inverted, np.linalg.LinAlgError):
+                pass  # go all the way on its own feet
+        near = min(self.states, key=lambda s: abs(s.indentation - indentation))
+        shortest = max(abs(indentation - near.indentation), 1e-3) / 2**_CUTS
+        step = float(np.clip(indentation - near.indentation, -_LONGEST, _LONGEST))
+        while near.indentation != indentation:
+            left = indentation - near.indentation
+            target = indentation if abs(step) >= abs(left) * (1 - 1e-9) else near.indentation + step
+            try:
+                near = self._settled(equilibrium(self.body, self._ahead(near, target)))
+            except (NotConverged, Inverted, np.linalg.LinAlgError):
+                step /= 2
+                if abs(step) < shortest:
+                    raise NotConverged(
+                        f"press: no equilibrium found beyond {near.indentation:.3g} mm on the way to "
+                        f"{indentation:.3g} mm"
+                    ) from None
+                continue
+            self.states.append(near)
+        return near
+
+    def _settled(self, state: State) -> State:
+        """Let the mesh follow until the pairs stand on each other."""
+        for _ in range(4):
+            if state.slip is None or not self.geometry.layout(state.model.layout.res).res.side:
+                return state
+            moved = _stray(self.geometry, state)
+            if np.abs(moved).max() < _STRAY:
+                return state
+            state = equilibrium(self.body, _shifted(self.geometry, state, state.model.shift + moved))
+        return state
+
+    def _ahead(self, near: State, indentation: float) -> State:
+        """Extrapolate the path to an indentation."""
+        known = self._line(near, indentation)
+        model = near.model
+        if len(known) == 1:
+            change = self._tangent(near) * (indentation - near.indentation)
+            moved = near.moved + change
+            guess = replace(near, indentation=indentation, moved=moved)
+            if not model.finite or not near.closed.all():
+                return guess
+            apart = (change[model.nodes.tip] - change[model.nodes.contact])[..., :2]
+            return _shifted(self.geometry, guess, model.shift + apart)
+        x = np.array([s.indentation for s in known])
+        weights = [
+            np.prod([(indentation - x[j]) / (x[i] - x[j]) for j in range(len(x)) if j != i])
+            for i in range(len(x))
+        ]
+        moved = np.asarray(sum(w * s.moved for w, s in zip(weights, known, strict=True)))
+        shift = np.asarray(sum(w * s.model.shift for w, s in zip(weights, known, strict=True)))
+        guess = replace(near, indentation=indentation, moved=moved)
+        return _shifted(self.geometry, guess, shift) if model.finite else guess
+
+    def _line(self, near: State, indentation: float) -> list[State]:
+        """Up to three states to extrapolate from, none of them nearer to the next than the way to go."""
+        known, way = [near], abs(indentation - near.indentation)
+        behind = [s for s in self.states if (s.indentation - near.indentation) * (indentation - near.indentation) < 0]
+        for state in sorted(behind, key=lambda s: abs(s.indentation - near.indentation)):
+            if abs(state.indentation - known[-1].indentation) >= 0.99 * way and len(known) < 3:
+                known.append(state)
+        return known if len(known) > 1 else [near, *behind[:1]]
+
+    def _aside(self, other: State) -> State:
+        """Guess from the state without inclusion and the difference that the inclusion made before."""
+        assert self.beside is not None
+        pairs = [
+            (s, o)
+            for s in self.states
+            for o in self.beside.states
+            if s.indentation == o.indentation and s.indentation != self.states[0].indentation
+        ]
+        if pairs:
+            s, o = min(pairs, key=lambda pair: abs(pair[0].indentation - other.indentation))
+            scale = (other.indentation - self.states[0].indentation) / (
+                s.indentation - self.states[0].indentation
+            )
+            difference = scale * (s.moved - o.moved)
+        elif other.closed.all() and self.states[0].closed.all():
+            rates = [p._tangent(p.states[0]) for p in (self, self.beside)]
+            difference = (rates[0] - rates[1]) * other.indentation
+        else:
+            difference = np.zeros_like(other.moved)
+        return replace(other, moved=other.moved + difference)
+
+    def _tangent(self, near: State) -> Floats:
+        """Change of the displacements per mm of indentation at the undeformed state."""
+        model = near.model
+        sys = model.system(near.closed)
+        held = model.chest(1.0)
+        load = -sys.gather(model.nodal(product(self.body.rest, held, model)))
+        return sys.expand(self.body.factor(sys, self.body.rest).solve(load)) + held
+
+
+def _stray(geometry: Geometry, state: State) -> Floats:
+    """How far the slab's nodes must move within its undeformed surface to be under the probe's; (nx, ny, 2)."""
+    assert state.slip is not None
+    model = state.model
+    under = model.place[model.nodes.contact]
+    now = np.stack([w.value(under[..., a]) for a, w in enumerate(state.slip.weights)], axis=1)
+    away = now.reshape(under.shape) - under
+    return np.asarray((away @ mesh.rotation(geometry.pose.tilt_deg).T)[..., :2])
+
+
+def _shifted(geometry: Geometry, state: State, shift: Floats) -> State:
+    """The state on a mesh that has followed; displacements stay, so the equilibrium is a little disturbed."""
+    return replace(state, model=follow(geometry, state.model, shift), slip=None)
+
+
+def path(geometry: Geometry, model: Model, inclusion: bool, beside: Path | None = None) -> Path:
+    """Start at first touch. `beside`: the path without inclusion, whose factor is shared."""
+    shear, bulk = moduli(geometry, model, inclusion)
+    if beside is None:
+        rest = elasticity.stiffness(model.quad, shear, bulk)
+    else:
+        rest, ball = beside.body.rest.copy(), model.ball
+        rest[ball] = elasticity.stiffness(model.quad, shear[ball], bulk[ball], elements=ball)
+    body = Body(shear, bulk, rest)
+    still = np.zeros_like(model.place)
+    clearance = model.gap(still, contact.slip(model.interface, model.place) if model.finite else None)
+    flat = bool(np.abs(clearance).max() < 1e-9)
+    start = 0.0 if flat else float(clearance.min() / model.normal[2])
+    closed = np.full(clearance.shape, flat)
+    if beside is not None and flat:
+        for key, factor in beside.body.factors.items():
+            if key == closed.tobytes():
+                body.factors[key] = solver.Factor(factor.tree, rest, base=factor)
+    apart = still - start * model.normal * (np.arange(len(still)) < model.nodes.slab)[:, None]
+    nothing = State(start, apart, closed, np.zeros(closed.shape), np.zeros(3), model)
+    return Path(geometry, body, [nothing], beside)
