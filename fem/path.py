@@ -34,7 +34,7 @@ def build(geometry: Geometry, res: Resolution, finite: bool, shift: Floats | Non
         layout,
         geometry.slab.sides,
         found,
-        Interface(found.contact, found.tip, line(x, layout.symmetric[0]), line(y, layout.symmetric[1])),
+        Interface(found.contact, found.tip, line(x), line(y)),
         join([quadrature(slab), quadrature(probe)]),
         place,
         np.zeros((*found.tip.shape, 2)) if shift is None else shift,
@@ -191,10 +191,14 @@ def _stray(geometry: Geometry, state: State) -> Floats:
     """How far the slab's nodes must move within its undeformed surface to be under the probe's; (nx, ny, 2)."""
     assert state.slip is not None
     model = state.model
-    under = model.place[model.nodes.contact]
-    now = np.stack([w.value(under[..., a]) for a, w in enumerate(state.slip.weights)], axis=1)
-    away = now.reshape(under.shape) - under
-    return np.asarray((away @ mesh.rotation(geometry.pose.tilt_deg).T)[..., :2])
+    face = model.interface
+    under = (model.place[model.nodes.contact] @ mesh.rotation(geometry.pose.tilt_deg).T)[..., :2]
+    # where the material under the probe's Gauss points was, less where their own partners were
+    away = [state.slip.weights.value(under[..., a]) - face.points(under[..., a]) for a in (0, 1)]
+    grid = np.stack([face.mean(a) for a in away], axis=-1)
+    middle = np.ones(grid.shape[1]) / grid.shape[1], np.ones(grid.shape[0]) / grid.shape[0]
+    along_x, along_y = grid[..., 0] @ middle[0], middle[1] @ grid[..., 1]
+    return np.stack(np.broadcast_arrays(along_x[:, None], along_y), axis=-1)
 
 
 def _shifted(geometry: Geometry, state: State, shift: Floats) -> State:
