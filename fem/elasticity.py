@@ -57,6 +57,12 @@ def _deform(quad: Quadrature, part: slice, moved: Floats) -> tuple[Floats, Float
     return gradient, f, inverse, det
 
 
+def slopes(quad: Quadrature, moved: Floats) -> Floats:
+    """Displacement gradients du_a / dX_b at the quadrature points, (m, q, 3, 3)."""
+    local = moved[quad.nodes].transpose(0, 2, 1)
+    return np.asarray((local[:, None] @ quad.gradient(slice(None))).transpose(0, 3, 2, 1))
+
+
 def _pressure(quad: Quadrature, part: slice, det: Floats, bulk: Floats) -> Floats:
     """Projected volumetric stress p, tension positive, kPa; shape (n, q)."""
     modes = quad.modes[part]
@@ -73,8 +79,8 @@ def _deviator(f: Floats, det: Floats, shear: Floats) -> tuple[Floats, Floats]:
     return b, mean
 
 
-def forces(quad: Quadrature, moved: Floats, shear: Floats, bulk: Floats) -> Floats:
-    """Internal forces of each element.
+def forces(quad: Quadrature, moved: Floats, shear: Floats, bulk: Floats) -> tuple[Floats, float]:
+    """Internal forces of each element, and the energy that all store.
 
     Parameters
     ----------
@@ -85,24 +91,28 @@ def forces(quad: Quadrature, moved: Floats, shear: Floats, bulk: Floats) -> Floa
 
     Returns
     -------
-    (m, 27, 3) array, mN.
+    (m, 27, 3) array, mN, the derivative of the energy, µJ.
 
     Raises
     ------
     Inverted
         Where a volume is not positive.
     """
-    out = np.empty((quad.size, NODES, 3))
+    out, energy = np.empty((quad.size, NODES, 3)), 0.0
     for part in _chunks(quad.size):
         gradient, f, inverse, det = _deform(quad, part, moved)
-        stress, _ = _deviator(f, det, shear[part])
-        stress += (_pressure(quad, part, det, bulk[part]) * det)[..., None, None] * np.eye(3)
+        stress, mean = _deviator(f, det, shear[part])
+        pressure = _pressure(quad, part, det, bulk[part])
+        # half p (J - 1) integrates to the projected energy, since p is in the space projected onto
+        stored = 1.5 * (mean - shear[part][:, None]) + 0.5 * pressure * (det - 1)
+        energy += float((quad.weight[part] * stored).sum())
+        stress += (pressure * det)[..., None, None] * np.eye(3)
         # first Piola-Kirchhoff stress P = tau F^-T, weighted
         piola = (stress @ inverse.transpose(0, 1, 3, 2)) * quad.weight[part][..., None, None]
         n, q = det.shape
         flat = gradient.transpose(0, 2, 1, 3).reshape(n, NODES, 3 * q)
         out[part] = flat @ piola.transpose(0, 3, 1, 2).reshape(n, 3 * q, 3)
-    return out
+    return out, energy
 
 
 def stiffness(
@@ -131,7 +141,7 @@ def stiffness(
     (n, 81, 81) array, kPa mm = mN / mm, local dof = 3 * node + axis, symmetric.
     """
     if elements is not None:
-        quad = Quadrature(*(getattr(quad, k)[elements] for k in ("nodes", "inverse", "weight", "modes")))
+        quad = quad.part(elements)
     out = np.empty((quad.size, DOFS, DOFS), dtype)
     still = np.zeros((int(quad.nodes.max()) + 1, 3)) if moved is None else moved
     for part in _chunks(quad.size):

@@ -18,9 +18,8 @@ from fem.topology import Resolution, materials
 
 Floats = NDArray[np.float64]
 
-_LONGEST = 1.0  # mm of indentation in one step
+_LONGEST = 3.0  # mm of indentation in one step
 _CUTS = 9  # halvings of a step at most
-_STRAY = 0.02  # mm that a pair of contact nodes may slide apart before the mesh follows
 
 
 def build(geometry: Geometry, res: Resolution, finite: bool, shift: Floats | None = None) -> Model:
@@ -49,14 +48,9 @@ def follow(geometry: Geometry, model: Model, shift: Floats) -> Model:
     slab = mesh.morph_slab(model.layout, geometry, shift)
     quad, place, cut = quadrature(slab), model.place.copy(), model.nodes.slab_cells
     place[: model.nodes.slab] = slab.doflocs.T
-    both = Quadrature(
-        model.quad.nodes,
-        *(
-            np.concatenate([getattr(quad, name), getattr(model.quad, name)[cut:]])
-            for name in ("inverse", "weight", "modes")
-        ),
-    )
-    return replace(model, quad=both, place=place, shift=shift)
+    probe = model.quad.part(np.arange(cut, model.quad.size))
+    fields = (np.concatenate([getattr(quad, f), getattr(probe, f)]) for f in ("inverse", "weight", "modes"))
+    return replace(model, quad=Quadrature(model.quad.nodes, *fields), place=place, shift=shift)
 
 
 def moduli(geometry: Geometry, model: Model, inclusion: bool) -> tuple[Floats, Floats]:
@@ -79,6 +73,8 @@ class Path:
     states: list[State]
     beside: Path | None = None
     """The same press without inclusion: its states are where to begin, and give the mesh."""
+    slide: Floats | None = None
+    """How far the slab's contact nodes follow per mm of indentation, (nx, ny, 2)."""
 
     def to(self, indentation: float) -> State:
         """Equilibrium at an indentation, mm.
@@ -102,7 +98,7 @@ class Path:
             left = indentation - near.indentation
             target = indentation if abs(step) >= abs(left) * (1 - 1e-9) else near.indentation + step
             try:
-                near = self._settled(equilibrium(self.body, self._ahead(near, target)))
+                near = equilibrium(self.body, self._ahead(near, target))
             except (NotConverged, Inverted, np.linalg.LinAlgError):
                 step /= 2
                 if abs(step) < shortest:
@@ -114,38 +110,33 @@ class Path:
             self.states.append(near)
         return near
 
-    def _settled(self, state: State) -> State:
-        """Let the mesh follow until the pairs stand on each other."""
-        for _ in range(4):
-            if state.slip is None or not self.geometry.layout(state.model.layout.res).res.side:
-                return state
-            moved = _stray(self.geometry, state)
-            if np.abs(moved).max() < _STRAY:
-                return state
-            state = equilibrium(self.body, _shifted(self.geometry, state, state.model.shift + moved))
-        return state
-
     def _ahead(self, near: State, indentation: float) -> State:
-        """Extrapolate the path to an indentation."""
+        """Extrapolate the path to an indentation, on the mesh that follows the slip expected there."""
         known = self._line(near, indentation)
-        model = near.model
         if len(known) == 1:
-            change = self._tangent(near) * (indentation - near.indentation)
-            moved = near.moved + change
-            guess = replace(near, indentation=indentation, moved=moved)
-            if not model.finite or not near.closed.all():
-                return guess
-            apart = (change[model.nodes.tip] - change[model.nodes.contact])[..., :2]
-            return _shifted(self.geometry, guess, model.shift + apart)
-        x = np.array([s.indentation for s in known])
-        weights = [
-            np.prod([(indentation - x[j]) / (x[i] - x[j]) for j in range(len(x)) if j != i])
-            for i in range(len(x))
-        ]
-        moved = np.asarray(sum(w * s.moved for w, s in zip(weights, known, strict=True)))
-        shift = np.asarray(sum(w * s.model.shift for w, s in zip(weights, known, strict=True)))
-        guess = replace(near, indentation=indentation, moved=moved)
-        return _shifted(self.geometry, guess, shift) if model.finite else guess
+            moved = near.moved + self._rate(near) * (indentation - near.indentation)
+        else:
+            x = np.array([s.indentation for s in known])
+            weights = [
+                np.prod([(indentation - x[j]) / (x[i] - x[j]) for j in range(len(x)) if j != i])
+                for i in range(len(x))
+            ]
+            moved = np.asarray(sum(w * s.moved for w, s in zip(weights, known, strict=True)))
+        guess = replace(near, indentation=indentation, moved=moved, slip=None)
+        return replace(guess, model=self._model(indentation)) if near.model.finite else guess
+
+    def _model(self, indentation: float) -> Model:
+        """The mesh for an indentation: contact nodes of the slab where the linear solution slides them to."""
+        first = self.states[0]
+        if not first.closed.all() or not first.model.layout.res.side:
+            return first.model
+        if self.slide is None:
+            apart = self._rate(first)
+            apart = (apart[first.model.nodes.tip] - apart[first.model.nodes.contact])[..., :2]
+            # lines move as a whole: what a corner does alone is left to the mortar
+            along_x, along_y = apart[..., 0].mean(axis=1), apart[..., 1].mean(axis=0)
+            self.slide = np.stack(np.broadcast_arrays(along_x[:, None], along_y), axis=-1)
+        return follow(self.geometry, first.model, indentation * self.slide)
 
     def _line(self, near: State, indentation: float) -> list[State]:
         """Up to three states to extrapolate from, none of them nearer to the next than the way to go."""
@@ -172,38 +163,19 @@ class Path:
             )
             difference = scale * (s.moved - o.moved)
         elif other.closed.all() and self.states[0].closed.all():
-            rates = [p._tangent(p.states[0]) for p in (self, self.beside)]
+            rates = [p._rate(p.states[0]) for p in (self, self.beside)]
             difference = (rates[0] - rates[1]) * other.indentation
         else:
             difference = np.zeros_like(other.moved)
         return replace(other, moved=other.moved + difference)
 
-    def _tangent(self, near: State) -> Floats:
+    def _rate(self, near: State) -> Floats:
         """Change of the displacements per mm of indentation at the undeformed state."""
         model = near.model
         sys = model.system(near.closed)
         held = model.chest(1.0)
         load = -sys.gather(model.nodal(product(self.body.rest, held, model)))
         return sys.expand(self.body.factor(sys, self.body.rest).solve(load)) + held
-
-
-def _stray(geometry: Geometry, state: State) -> Floats:
-    """How far the slab's nodes must move within its undeformed surface to be under the probe's; (nx, ny, 2)."""
-    assert state.slip is not None
-    model = state.model
-    face = model.interface
-    under = (model.place[model.nodes.contact] @ mesh.rotation(geometry.pose.tilt_deg).T)[..., :2]
-    # where the material under the probe's Gauss points was, less where their own partners were
-    away = [state.slip.weights.value(under[..., a]) - face.points(under[..., a]) for a in (0, 1)]
-    grid = np.stack([face.mean(a) for a in away], axis=-1)
-    middle = np.ones(grid.shape[1]) / grid.shape[1], np.ones(grid.shape[0]) / grid.shape[0]
-    along_x, along_y = grid[..., 0] @ middle[0], middle[1] @ grid[..., 1]
-    return np.stack(np.broadcast_arrays(along_x[:, None], along_y), axis=-1)
-
-
-def _shifted(geometry: Geometry, state: State, shift: Floats) -> State:
-    """The state on a mesh that has followed; displacements stay, so the equilibrium is a little disturbed."""
-    return replace(state, model=follow(geometry, state.model, shift), slip=None)
 
 
 def path(geometry: Geometry, model: Model, inclusion: bool, beside: Path | None = None) -> Path:

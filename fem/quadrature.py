@@ -48,6 +48,10 @@ class Quadrature:
         reference = _REFERENCE.transpose(2, 1, 0)  # (points, 3, nodes)
         return (self.inverse[part] @ reference[None]).transpose(0, 2, 3, 1).reshape(n, 3, NODES, -1)
 
+    def part(self, elements: Ints) -> Quadrature:
+        """The same for some of the elements."""
+        return Quadrature(*(field[elements] for field in (self.nodes, self.inverse, self.weight, self.modes)))
+
     @property
     def size(self) -> int:
         """Number of elements."""
