@@ -77,7 +77,8 @@ def groups_of(dofs: Ints, centres: Floats) -> Groups:
     code = np.random.default_rng(0).integers(1 << 63, size=len(dofs), dtype=np.uint64)
     name = np.zeros(unknown.max() + 1, dtype=np.uint64)
     np.add.at(name, unknown, code[element])
-    group = np.unique(name, return_inverse=True)[1]
+    _, first, group = np.unique(name, return_index=True, return_inverse=True)
+    group = np.argsort(np.argsort(first))[group]  # numbered as they come: nothing depends on the names
     weight = np.append(np.bincount(group), 0)
     groups = len(weight) - 1
     owner, kind = np.divmod(np.unique(element * groups + group[unknown]), groups)

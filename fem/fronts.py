@@ -207,16 +207,15 @@ def _batched(fronts: list[Front], order: Ints, dofs: Ints) -> Tree:
             small = [i for i in here if fronts[i].pivots <= _PANEL and fronts[i].volatile == volatile]
             small.sort(key=lambda i: (fronts[i].pivots, fronts[i].size, i))
             chosen: list[int] = []
-            used = 0
+            used = below = 0
             for i in small:
-                p, f = fronts[i].pivots, fronts[i].size
-                widest = max((len(fronts[j].border) for j in chosen), default=0)
-                full = (len(chosen) + 1) * p * (p + max(widest, f - p))
-                if chosen and full > _PADDING * (used + p * f):
+                p, b = fronts[i].pivots, len(fronts[i].border)
+                below = max(below, b)
+                if chosen and (len(chosen) + 1) * p * (p + below) > _PADDING * (used + p * (p + b)):
                     add(chosen)
-                    chosen, used = [], 0
+                    chosen, used, below = [], 0, b
                 chosen.append(i)
-                used += p * f
+                used += p * (p + b)
             if chosen:
                 add(chosen)
         for i in here:
