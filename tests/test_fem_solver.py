@@ -109,6 +109,21 @@ def test_another_stiffness_of_the_kept_elements(problem: tuple[System, np.ndarra
     np.testing.assert_array_equal(base.precondition(load), before)
 
 
+@pytest.mark.parametrize("times", [0.05, 1e4])
+def test_one_factor_for_other_matrices(problem: tuple[System, np.ndarray], times: float) -> None:
+    """Near or far: the answer is that of the matrices asked for."""
+    sys, matrices = problem
+    other = matrices.copy()
+    other[sys.material == 1] *= times
+    load = np.random.default_rng(5).normal(size=sys.tree.size)
+    factor = solver.Factor(sys.tree, matrices)
+    before = factor.precondition(load)
+    expected = solver.Factor(sys.tree, other, precision="double").solve(load)
+    found = factor.solve(load, matrices=other)
+    np.testing.assert_allclose(found, expected, atol=1e-9 * np.abs(expected).max())
+    np.testing.assert_array_equal(factor.precondition(load), before)
+
+
 def test_matrices_in_single_precision_or_made_on_demand(problem: tuple[System, np.ndarray]) -> None:
     """The factor is the same; sums stay double, so that the solution is that of the rounded matrices."""
     sys, matrices = problem
