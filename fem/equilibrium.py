@@ -23,6 +23,7 @@ from fem.topology import Layout
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
+Ints = NDArray[np.int64]
 
 _TOLERANCE = 1e-9  # of the residual, relative to the reaction at the chest wall
 _FORCING = 1e-3  # to which conjugate gradients solve each Newton step
@@ -30,8 +31,7 @@ _HALVINGS = 8  # of a Newton step at most
 _NEWTON = 25  # steps at most
 _PATIENCE = 12  # steps after which the residual must have come down to a hundredth of the reaction
 _WORTH = 15  # iterations of conjugate gradients that are worth a new factor
-DEBUG = False
-SLIDE = True
+_CHUNK = 128  # element matrices made double at a time
 _SETS = 40  # changes of the active set at most
 
 
@@ -59,6 +59,11 @@ class Model:
         moved = np.zeros_like(self.place)
         moved[self.nodes.chest] = -indentation * self.normal
         return moved
+
+    @property
+    def share(self) -> int:
+        """How many times the part that is meshed makes up the whole."""
+        return 2 ** sum(self.layout.symmetric)
 
     def system(self, closed: Bools) -> System:
         return system(self.layout, self.sides, closed)
@@ -108,13 +113,31 @@ class Effort:
     sets: int = 0
 
 
+@dataclass(frozen=True)
+class Stiffness:
+    """Element matrices (m, 81, 81), those of some elements replaced: what bodies share is stored once."""
+
+    matrices: NDArray[np.floating]
+    other: Ints | None = None
+    instead: NDArray[np.floating] | None = None
+
+    def __call__(self, elements: Ints) -> NDArray[np.floating]:
+        """Matrices of some elements."""
+        found = self.matrices[elements]
+        if self.other is not None and self.instead is not None:
+            at = np.searchsorted(self.other, elements)
+            hit = self.other[np.minimum(at, len(self.other) - 1)] == elements
+            found[hit] = self.instead[at[hit]]
+        return found
+
+
 @dataclass
 class Body:
     """All moduli, and the factors found so far."""
 
     shear: Floats
     bulk: Floats
-    rest: NDArray[np.floating]  # stiffness of the undeformed elements, (m, 81, 81)
+    rest: Stiffness  # of the undeformed elements
     factors: dict[bytes, solver.Factor] = field(default_factory=dict)
     effort: Effort = field(default_factory=Effort)
 
@@ -126,13 +149,13 @@ class Body:
         total = model.nodal(product(self.rest, moved, model))
         return total, 0.5 * float((total * moved).sum())
 
-    def tangent(self, model: Model, moved: Floats) -> NDArray[np.floating]:
-        """Tangent stiffness of the elements, (m, 81, 81)."""
+    def tangent(self, model: Model, moved: Floats) -> Stiffness:
+        """Tangent stiffness of the elements."""
         if not model.finite:
             return self.rest
-        return elasticity.stiffness(model.quad, self.shear, self.bulk, moved, dtype=self.rest.dtype)
+        return Stiffness(elasticity.stiffness(model.quad, self.shear, self.bulk, moved, dtype=np.float32))
 
-    def factor(self, sys: System, matrices: NDArray[np.floating], renew: bool = False) -> solver.Factor:
+    def factor(self, sys: System, matrices: Stiffness, renew: bool = False) -> solver.Factor:
         """Factor of the tied stiffness for a set of closed pairs; an old one serves unless renewed."""
         key = sys.closed.tobytes()
         if renew or key not in self.factors:
@@ -142,10 +165,15 @@ class Body:
         return self.factors[key]
 
 
-def product(matrices: NDArray[np.floating], moved: Floats, model: Model) -> Floats:
-    """Forces (m, 27, 3) of element matrices on displacements (nodes, 3)."""
+def product(matrices: Stiffness, moved: Floats, model: Model) -> Floats:
+    """Forces (m, 27, 3) of element matrices on displacements (nodes, 3); sums are double in any case."""
     local = moved[model.nodes.cells].reshape(-1, DOFS, 1)
-    return np.asarray(matrices @ local.astype(matrices.dtype), dtype=float).reshape(-1, 27, 3)
+    force = np.empty_like(local)
+    for start in range(0, len(local), _CHUNK):
+        part = np.arange(start, min(start + _CHUNK, len(local)))
+        some = matrices(part).astype(np.float64, copy=False)
+        np.matmul(some, local[part], out=force[start : start + len(part)])
+    return force.reshape(-1, 27, 3)
 
 
 def equilibrium(body: Body, guess: State) -> State:
@@ -194,7 +222,6 @@ def _newton(body: Body, start: State) -> State:
         normal = np.where(closed, forces[tip, 2], 0.0)
         residual = sys.gather(_reduce(found, forces, normal, tip))
         size, scale = float(np.linalg.norm(residual)), float(np.linalg.norm(forces[at_chest]))
-        if DEBUG: print("      it", size/scale, energy, closed.mean(), body.effort.cg)
         if size <= _TOLERANCE * scale or scale == 0.0:
             return replace(start, moved=moved, force=-normal, chest=-forces[at_chest].sum(axis=0), slip=found)
         if turn >= _PATIENCE and size > 1e-2 * scale:
@@ -235,7 +262,7 @@ def _solve(
     model: Model,
     sys: System,
     found: Slip | None,
-    matrices: NDArray[np.floating],
+    matrices: Stiffness,
     factor: solver.Factor,
     normal: Floats,
     load: Floats,
@@ -251,7 +278,7 @@ def _solve(
         return change
 
     if not model.finite:
-        answer = factor.solve(load)
+        answer = factor.solve(load, matrices=matrices)
         return expand(answer), 1, float(load @ answer)
 
     def apply(values: Floats) -> Floats:

@@ -148,8 +148,8 @@ def _span(centre: float, radius: float, half: float, side: float, position: floa
 
     def within(line: float, inset_low: float, inset_high: float) -> float:
         """Pull a line smoothly inside of the probe's edges."""
-        line = line - _softplus(line - (half - inset_high), 0.3 * margin)
-        return line + _softplus(-(half - inset_low) - line, 0.3 * margin)
+        over = _softplus(line - (half - inset_high), 0.3 * margin)
+        return line - over + _softplus(-(half - inset_low) - line, 0.3 * margin)
 
     high, edge_high, side_high = deep(1)
     low, edge_low, side_low = (-value for value in deep(-1))

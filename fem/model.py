@@ -56,6 +56,10 @@ class NotModelled(ValueError):
     """Physics that this version does not model, such as contact that opens: one line says which."""
 
 
+class NotConverged(ValueError):
+    """No equilibrium was found: one line says how far the press got."""
+
+
 @dataclass(frozen=True, config=_STRICT)
 class Layer:
     """One elastic layer of the waveguide."""

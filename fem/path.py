@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fem import contact, elasticity, mesh, solver
 from fem.contact import Interface, line
 from fem.elasticity import Inverted
-from fem.equilibrium import Body, Model, NotConverged, State, equilibrium, product
+from fem.equilibrium import Body, Model, NotConverged, State, Stiffness, equilibrium, product
 from fem.mesh import Geometry
 from fem.quadrature import Quadrature, join, quadrature
 from fem.system import nodes
@@ -19,6 +19,8 @@ from fem.topology import Resolution, materials
 Floats = NDArray[np.float64]
 
 _LONGEST = 3.0  # mm of indentation in one step
+_MANY = 4500  # elements from which on their stiffness is kept in single precision
+_SECANT, _FORCE = 25, 1e-9  # steps to find a force, and how well to meet it
 _CUTS = 9  # halvings of a step at most
 
 
@@ -75,6 +77,7 @@ class Path:
     """The same press without inclusion: its states are where to begin, and give the mesh."""
     slide: Floats | None = None
     """How far the slab's contact nodes follow per mm of indentation, (nx, ny, 2)."""
+    _rate: Floats | None = None
 
     def to(self, indentation: float) -> State:
         """Equilibrium at an indentation, mm.
@@ -114,7 +117,7 @@ class Path:
         """Extrapolate the path to an indentation, on the mesh that follows the slip expected there."""
         known = self._line(near, indentation)
         if len(known) == 1:
-            moved = near.moved + self._rate(near) * (indentation - near.indentation)
+            moved = near.moved + self.rate() * (indentation - near.indentation)
         else:
             x = np.array([s.indentation for s in known])
             weights = [
@@ -125,13 +128,40 @@ class Path:
         guess = replace(near, indentation=indentation, moved=moved, slip=None)
         return replace(guess, model=self._model(indentation)) if near.model.finite else guess
 
+    def by_force(self, force: float) -> State:
+        """Equilibrium under a force along z on the part that is meshed, mN.
+
+        Raises
+        ------
+        NotConverged
+            If no indentation gives that force.
+        """
+        first = self.states[0]
+
+        def error(state: State) -> float:
+            return float(state.force.sum()) - force
+
+        known = [s for s in self.states if s is not first]
+        state = min(known, key=lambda s: abs(error(s))) if known else self.to(first.indentation + 0.5)
+        before = first
+        for _ in range(_SECANT):
+            if abs(error(state)) <= _FORCE * force:
+                return state
+            slope = (error(state) - error(before)) / (state.indentation - before.indentation)
+            if not slope > 0:
+                break
+            wish = state.indentation - error(state) / slope
+            wish = max(wish, 0.5 * (first.indentation + state.indentation))
+            before, state = state, self.to(wish)
+        raise NotConverged("press: no indentation found that gives the force")
+
     def _model(self, indentation: float) -> Model:
         """The mesh for an indentation: contact nodes of the slab where the linear solution slides them to."""
         first = self.states[0]
         if not first.closed.all() or not first.model.layout.res.side:
             return first.model
         if self.slide is None:
-            apart = self._rate(first)
+            apart = self.rate()
             apart = (apart[first.model.nodes.tip] - apart[first.model.nodes.contact])[..., :2]
             # lines move as a whole: what a corner does alone is left to the mortar
             along_x, along_y = apart[..., 0].mean(axis=1), apart[..., 1].mean(axis=0)
@@ -163,39 +193,39 @@ class Path:
             )
             difference = scale * (s.moved - o.moved)
         elif other.closed.all() and self.states[0].closed.all():
-            rates = [p._rate(p.states[0]) for p in (self, self.beside)]
+            rates = [p.rate() for p in (self, self.beside)]
             difference = (rates[0] - rates[1]) * other.indentation
         else:
             difference = np.zeros_like(other.moved)
         return replace(other, moved=other.moved + difference)
 
-    def _rate(self, near: State) -> Floats:
-        """Change of the displacements per mm of indentation at the undeformed state."""
-        model = near.model
-        sys = model.system(near.closed)
-        held = model.chest(1.0)
-        load = -sys.gather(model.nodal(product(self.body.rest, held, model)))
-        return sys.expand(self.body.factor(sys, self.body.rest).solve(load)) + held
+    def rate(self) -> Floats:
+        """Displacements per mm of a linear press with all pairs closed, (nodes, 3) mm / mm."""
+        if self._rate is None:
+            model = self.states[0].model
+            sys = model.system(np.ones(model.nodes.tip.shape, dtype=bool))
+            held = model.chest(1.0)
+            load = -sys.gather(model.nodal(product(self.body.rest, held, model)))
+            factor = self.body.factor(sys, self.body.rest)
+            self._rate = sys.expand(factor.solve(load, matrices=self.body.rest)) + held
+        return self._rate
 
 
 def path(geometry: Geometry, model: Model, inclusion: bool, beside: Path | None = None) -> Path:
     """Start at first touch. `beside`: the path without inclusion, whose factor is shared."""
     shear, bulk = moduli(geometry, model, inclusion)
     if beside is None:
-        rest = elasticity.stiffness(model.quad, shear, bulk)
+        kind = np.float32 if model.finite or model.quad.size > _MANY else np.float64
+        rest = Stiffness(elasticity.stiffness(model.quad, shear, bulk, dtype=kind))
     else:
-        rest, ball = beside.body.rest.copy(), model.ball
-        rest[ball] = elasticity.stiffness(model.quad, shear[ball], bulk[ball], elements=ball)
-    body = Body(shear, bulk, rest)
+        ball = elasticity.stiffness(model.quad, shear[model.ball], bulk[model.ball], elements=model.ball)
+        rest = replace(beside.body.rest, other=model.ball, instead=ball)
+    body = Body(shear, bulk, rest, {} if beside is None else beside.body.factors)
     still = np.zeros_like(model.place)
     clearance = model.gap(still, contact.slip(model.interface, model.place) if model.finite else None)
     flat = bool(np.abs(clearance).max() < 1e-9)
     start = 0.0 if flat else float(clearance.min() / model.normal[2])
     closed = np.full(clearance.shape, flat)
-    if beside is not None and flat:
-        for key, factor in beside.body.factors.items():
-            if key == closed.tobytes():
-                body.factors[key] = solver.Factor(factor.tree, rest, base=factor)
     apart = still - start * model.normal * (np.arange(len(still)) < model.nodes.slab)[:, None]
     nothing = State(start, apart, closed, np.zeros(closed.shape), np.zeros(3), model)
     return Path(geometry, body, [nothing], beside)
