@@ -34,7 +34,7 @@ _PATIENCE = 12  # steps after which the residual must have come down to a hundre
 _WORTH = 15  # iterations of conjugate gradients that are worth a new factor
 _CHUNK = 128  # element matrices made double at a time
 DEBUG = False
-_TURNS, _RELAX = 6, 0.6
+_TURNS, _RELAX = 2, 0.6
 _TURN = 1e-3  # change of the contact's slope that is left, in shares of the largest force
 _SETS = 40  # changes of the active set at most
 

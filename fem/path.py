@@ -18,7 +18,7 @@ from fem.topology import Resolution, materials
 
 Floats = NDArray[np.float64]
 
-_LONGEST = 3.0  # mm of indentation in one step
+_LONGEST = 1.0  # mm of indentation in one step
 _MANY = 4500  # elements from which on their stiffness is kept in single precision
 _SECANT, _FORCE = 25, 1e-9  # steps to find a force, and how well to meet it
 _CUTS = 9  # halvings of a step at most
