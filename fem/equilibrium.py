@@ -9,6 +9,7 @@ that pull are opened, open pairs that overlap are closed, until neither is left.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,6 +60,11 @@ class Model:
         moved = np.zeros_like(self.place)
         moved[self.nodes.chest] = -indentation * self.normal
         return moved
+
+    @property
+    def slab(self) -> Floats:
+        """1 at the slab's nodes, 0 at the probe's; (nodes, 1)."""
+        return (np.arange(len(self.place)) < self.nodes.slab)[:, None].astype(float)
 
     @property
     def share(self) -> int:
@@ -138,8 +144,17 @@ class Body:
     shear: Floats
     bulk: Floats
     rest: Stiffness  # of the undeformed elements
+    finite: bool
+    stiff: bool  # with the inclusion
     factors: dict[bytes, solver.Factor] = field(default_factory=dict)
     effort: Effort = field(default_factory=Effort)
+
+    @cached_property
+    def floor(self) -> float:
+        """Residual that is rounding, mN: what the largest entries leave after they cancel."""
+        kind, largest = self.rest.matrices.dtype, float(np.abs(self.rest.matrices).max())
+        double = kind == np.float64 or self.finite  # finite strain's forces do not come from the matrices
+        return (1e4 * float(np.finfo(np.float64).eps) if double else 20 * float(np.finfo(kind).eps)) * largest
 
     def forces(self, model: Model, moved: Floats) -> tuple[Floats, float]:
         """Internal forces (nodes, 3), mN, and stored energy, µJ."""
@@ -222,7 +237,7 @@ def _newton(body: Body, start: State) -> State:
         normal = np.where(closed, forces[tip, 2], 0.0)
         residual = sys.gather(_reduce(found, forces, normal, tip))
         size, scale = float(np.linalg.norm(residual)), float(np.linalg.norm(forces[at_chest]))
-        if size <= _TOLERANCE * scale or scale == 0.0:
+        if size <= max(_TOLERANCE * scale, body.floor):
             return replace(start, moved=moved, force=-normal, chest=-forces[at_chest].sum(axis=0), slip=found)
         if turn >= _PATIENCE and size > 1e-2 * scale:
             raise NotConverged("Newton's method does not come down")
@@ -239,7 +254,7 @@ def _newton(body: Body, start: State) -> State:
                 forces_t, energy_t = body.forces(model, trial)
             except Inverted:
                 continue
-            if size < 1e-3 * scale or energy_t <= energy - 1e-4 * 0.5**cut * downhill:
+            if not model.finite or size < 1e-3 * scale or energy_t <= energy - 1e-4 * 0.5**cut * downhill:
                 break
         else:
             raise NotConverged("no step lowers the energy")

@@ -77,6 +77,8 @@ class Path:
     """The same press without inclusion: its states are where to begin, and give the mesh."""
     slide: Floats | None = None
     """How far the slab's contact nodes follow per mm of indentation, (nx, ny, 2)."""
+    linear: Path | None = None
+    """The same press in small strain."""
     _rate: Floats | None = None
 
     def to(self, indentation: float) -> State:
@@ -116,8 +118,16 @@ class Path:
     def _ahead(self, near: State, indentation: float) -> State:
         """Extrapolate the path to an indentation, on the mesh that follows the slip expected there."""
         known = self._line(near, indentation)
-        if len(known) == 1:
+        if len(known) == 1 and near.closed.all():
             moved = near.moved + self.rate() * (indentation - near.indentation)
+        elif len(known) == 1 and near.model.finite:  # nothing touches yet: begin where small strain ends
+            if self.linear is None:
+                small = replace(near.model, finite=False)
+                self.linear = path(self.geometry, small, self.body.stiff)
+            begun = self.linear.to(indentation)
+            return replace(begun, model=near.model)
+        elif len(known) == 1:  # the slab comes nearer as a whole
+            moved = near.moved - (indentation - near.indentation) * near.model.normal * near.model.slab
         else:
             x = np.array([s.indentation for s in known])
             weights = [
@@ -220,12 +230,12 @@ def path(geometry: Geometry, model: Model, inclusion: bool, beside: Path | None 
     else:
         ball = elasticity.stiffness(model.quad, shear[model.ball], bulk[model.ball], elements=model.ball)
         rest = replace(beside.body.rest, other=model.ball, instead=ball)
-    body = Body(shear, bulk, rest, {} if beside is None else beside.body.factors)
+    body = Body(shear, bulk, rest, model.finite, inclusion, {} if beside is None else beside.body.factors)
     still = np.zeros_like(model.place)
     clearance = model.gap(still, contact.slip(model.interface, model.place) if model.finite else None)
     flat = bool(np.abs(clearance).max() < 1e-9)
     start = 0.0 if flat else float(clearance.min() / model.normal[2])
     closed = np.full(clearance.shape, flat)
-    apart = still - start * model.normal * (np.arange(len(still)) < model.nodes.slab)[:, None]
+    apart = still - start * model.normal * model.slab
     nothing = State(start, apart, closed, np.zeros(closed.shape), np.zeros(3), model)
     return Path(geometry, body, [nothing], beside)
