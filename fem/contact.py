@@ -172,6 +172,14 @@ class Slip:
         parts = [self.interface.points(probe[..., a]) - self.weights.value(slab[..., a]) for a in (0, 1)]
         return np.stack(parts, axis=1)
 
+    def nodal_slope(self, nodes: int) -> Floats:
+        """G at the pairs' nodes of both bodies, 0 at others; (nodes, 2)."""
+        out = np.zeros((nodes, 2))
+        for a in (0, 1):
+            mean = self.interface.mean(self.slope[:, a])
+            out[self.interface.slab, a] = out[self.interface.probe, a] = mean
+        return out
+
     def push(self, force: Floats, out: Floats) -> None:
         """Transpose of `moved`: add the forces (nx, ny) that act through it to `out` (nodes, 3)."""
         at = self.interface.spread_mean(force)

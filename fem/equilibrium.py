@@ -137,6 +137,17 @@ class Stiffness:
         return found
 
 
+    def sheared(self, cells: Ints, slope: Floats) -> Stiffness:
+        """In the unknowns x, y and z - G . (x, y) at each node; slope G (nodes, 2)."""
+        touched = np.flatnonzero(np.abs(slope[cells]).max(axis=(1, 2)) > 0)
+        some = self(touched).copy()
+        g = slope[cells[touched]].astype(some.dtype)  # (n, 27, 2)
+        for a in (0, 1):
+            some[:, :, a::3] += some[:, :, 2::3] * g[:, None, :, a]
+            some[:, a::3] += some[:, 2::3] * g[:, :, a, None]
+        return Stiffness(self.matrices, touched, some)
+
+
 @dataclass
 class Body:
     """All moduli, and the factors found so far."""
@@ -146,7 +157,7 @@ class Body:
     rest: Stiffness  # of the undeformed elements
     finite: bool
     stiff: bool  # with the inclusion
-    factors: dict[bytes, solver.Factor] = field(default_factory=dict)
+    factors: dict[bytes, Preconditioner] = field(default_factory=dict)
     effort: Effort = field(default_factory=Effort)
 
     @cached_property
@@ -170,14 +181,48 @@ class Body:
             return self.rest
         return Stiffness(elasticity.stiffness(model.quad, self.shear, self.bulk, moved, dtype=np.float32))
 
-    def factor(self, sys: System, matrices: Stiffness, renew: bool = False) -> solver.Factor:
+    def factor(
+        self, sys: System, matrices: Stiffness, slope: Floats | None = None, renew: bool = False
+    ) -> Preconditioner:
         """Factor of the tied stiffness for a set of closed pairs; an old one serves unless renewed."""
         key = sys.closed.tobytes()
         if renew or key not in self.factors:
             self.factors.clear()
-            self.factors[key] = solver.Factor(sys.tree, matrices)
+            made = matrices if slope is None else matrices.sheared(sys.nodes.cells, slope)
+            self.factors[key] = Preconditioner(sys, solver.Factor(sys.tree, made), slope)
             self.effort.factors += 1
         return self.factors[key]
+
+
+@dataclass(frozen=True)
+class Preconditioner:
+    """Factor of a stiffness in which closed pairs are tied across their tangent plane.
+
+    With slopes G, the unknown that a pair shares is the height z - G . (x, y) above that plane.
+    """
+
+    sys: System
+    factor: solver.Factor
+    slope: Floats | None  # G of each node, (nodes, 2); zero off the contact
+
+    def __call__(self, load: Floats) -> Floats:
+        """One substitution."""
+        if self.slope is None:
+            return self.factor.precondition(load)
+        at, unknown = self.sys.nodes.contact.ravel(), self.sys.unknown.reshape(-1, 3)
+        rise = unknown[at, 2]
+        pairs = [(unknown[at, a], self.slope[at, a]) for a in (0, 1)]
+        turned = load.copy()
+        for level, g in pairs:
+            free = level >= 0
+            turned[level[free]] += (g * load[rise])[free]
+        found = self.factor.precondition(turned)
+        lift = found[rise].copy()
+        for level, g in pairs:
+            free = level >= 0
+            lift[free] += (g[free]) * found[level[free]]
+        found[rise] = lift
+        return found
 
 
 def product(matrices: Stiffness, moved: Floats, model: Model) -> Floats:
@@ -242,7 +287,8 @@ def _newton(body: Body, start: State) -> State:
         if turn >= _PATIENCE and size > 1e-2 * scale:
             raise NotConverged("Newton's method does not come down")
         matrices = body.tangent(model, moved)
-        factor = body.factor(sys, matrices, renew)
+        slope = None if found is None else found.nodal_slope(len(model.place))
+        factor = body.factor(sys, matrices, slope, renew)
         change, steps, downhill = _solve(body, model, sys, found, matrices, factor, normal, -residual)
         renew = model.finite and steps > _WORTH
         body.effort.newton += 1
@@ -278,7 +324,7 @@ def _solve(
     sys: System,
     found: Slip | None,
     matrices: Stiffness,
-    factor: solver.Factor,
+    factor: Preconditioner,
     normal: Floats,
     load: Floats,
 ) -> tuple[Floats, int, float]:
@@ -293,7 +339,7 @@ def _solve(
         return change
 
     if not model.finite:
-        answer = factor.solve(load, matrices=matrices)
+        answer = factor.factor.solve(load, matrices=matrices)
         return expand(answer), 1, float(load @ answer)
 
     def apply(values: Floats) -> Floats:
@@ -315,7 +361,7 @@ def _solve(
         load,
         rtol=_FORCING,
         maxiter=200,
-        M=LinearOperator(shape, matvec=factor.precondition, dtype=float),
+        M=LinearOperator(shape, matvec=factor, dtype=float),
         callback=tick,
     )
     body.effort.cg += count[0]

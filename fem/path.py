@@ -217,7 +217,7 @@ class Path:
             held = model.chest(1.0)
             load = -sys.gather(model.nodal(product(self.body.rest, held, model)))
             factor = self.body.factor(sys, self.body.rest)
-            self._rate = sys.expand(factor.solve(load, matrices=self.body.rest)) + held
+            self._rate = sys.expand(factor.factor.solve(load, matrices=self.body.rest)) + held
         return self._rate
 
 
