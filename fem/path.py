@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fem import contact, elasticity, mesh, solver
-from fem.contact import Interface, line
+from fem import elasticity, mesh, solver
+from fem.contact import Interface, recovery
 from fem.elasticity import Inverted
 from fem.equilibrium import Body, Model, NotConverged, State, Stiffness, equilibrium, product
 from fem.mesh import Geometry
@@ -18,7 +18,7 @@ from fem.topology import Resolution, materials
 
 Floats = NDArray[np.float64]
 
-_LONGEST = 3.0  # mm of indentation in one step
+_LONGEST = 1.0  # mm of indentation in one step
 _MANY = 4500  # elements from which on their stiffness is kept in single precision
 _SECANT, _FORCE = 25, 1e-9  # steps to find a force, and how well to meet it
 _CUTS = 9  # halvings of a step at most
@@ -35,7 +35,7 @@ def build(geometry: Geometry, res: Resolution, finite: bool, shift: Floats | Non
         layout,
         geometry.slab.sides,
         found,
-        Interface(found.contact, found.tip, line(x), line(y)),
+        Interface(found.contact, found.tip, recovery(x), recovery(y), layout.symmetric),
         join([quadrature(slab), quadrature(probe)]),
         place,
         np.zeros((*found.tip.shape, 2)) if shift is None else shift,
@@ -135,7 +135,7 @@ class Path:
                 for i in range(len(x))
             ]
             moved = np.asarray(sum(w * s.moved for w, s in zip(weights, known, strict=True)))
-        guess = replace(near, indentation=indentation, moved=moved, slip=None)
+        guess = replace(near, indentation=indentation, moved=moved)
         return replace(guess, model=self._model(indentation)) if near.model.finite else guess
 
     def by_force(self, force: float) -> State:
@@ -232,10 +232,11 @@ def path(geometry: Geometry, model: Model, inclusion: bool, beside: Path | None 
         rest = replace(beside.body.rest, other=model.ball, instead=ball)
     body = Body(shear, bulk, rest, model.finite, inclusion, {} if beside is None else beside.body.factors)
     still = np.zeros_like(model.place)
-    clearance = model.gap(still, contact.slip(model.interface, model.place) if model.finite else None)
+    level = np.zeros((*model.nodes.tip.shape, 2))
+    clearance = model.interface.gap(model.place, level)
     flat = bool(np.abs(clearance).max() < 1e-9)
     start = 0.0 if flat else float(clearance.min() / model.normal[2])
     closed = np.full(clearance.shape, flat)
     apart = still - start * model.normal * model.slab
-    nothing = State(start, apart, closed, np.zeros(closed.shape), np.zeros(3), model)
+    nothing = State(start, apart, closed, np.zeros(closed.shape), np.zeros(3), model, level)
     return Path(geometry, body, [nothing], beside)

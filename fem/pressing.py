@@ -374,16 +374,13 @@ def _contact(geometry: Geometry, states: tuple[State, State], edge: int) -> tupl
     whole_x, whole_y = surface.mirror_line(x, half[0]), surface.mirror_line(y, half[1])
     contact = surface.contact_surface(whole_x, whole_y, surface.mirror_grid(at[..., 2], symmetric=half))
     lumped = np.outer(surface.line_weights(whole_x), surface.line_weights(whole_y)).ravel()
-    along = surface.recovery(x), surface.recovery(y)
     lowest = np.inf
     for suffix, state in zip(("", "_0"), states, strict=True):
         moved = state.moved[nodes.tip]
         pressure = surface.pressure(np.maximum(state.force, 0.0), x, y, edge, state.closed)
         stretch = np.ones(pressure.shape)
         if state.model.finite:  # area that the deformed surface covers, seen along z
-            lateral = (at + moved)[..., :2]
-            dx, dy = np.tensordot(along[0], lateral, 1), np.einsum("jk,ikc->ijc", along[1], lateral)
-            stretch = dx[..., 0] * dy[..., 1] - dx[..., 1] * dy[..., 0]
+            stretch = np.linalg.det(state.model.interface.derivatives(at + moved)[..., :2])
         if not np.isfinite(pressure).all():
             raise NotModelled(_TOO_UNEVEN)
         pressure = pressure / stretch

@@ -45,17 +45,6 @@ def line_weights(x: Floats) -> Floats:
     return weights
 
 
-def recovery(x: Floats) -> Floats:
-    """Matrix (n, n) of the derivative at the nodes of a line of quadratic elements, the mean of both sides
-    at shared nodes; x (n,) are the nodes, n odd."""
-    local = np.array([[-3.0, 4.0, -1.0], [-1.0, 0.0, 1.0], [1.0, -4.0, 3.0]])
-    matrix, count = np.zeros((len(x), len(x))), np.zeros(len(x))
-    for i in range(0, len(x) - 2, 2):
-        matrix[i : i + 3, i : i + 3] += local / (x[i + 2] - x[i])
-        count[i : i + 3] += 1
-    return matrix / count[:, None]
-
-
 _CONSISTENT = np.array([[4.0, 2.0, -1.0], [2.0, 16.0, 2.0], [-1.0, 2.0, 4.0]]) / 30
 _SIMPSON = np.diag([1.0, 4.0, 1.0]) / 6
 
