@@ -50,10 +50,10 @@ def draw_cut(axes: Axes, frame: Pictured, letter: str) -> None:
         corner = (min(sign * face, sign * (face + 0.8)), led.z_mm - led.diameter_mm / 2)
         axes.add_patch(Rectangle(corner, 0.8, led.diameter_mm, facecolor=LED, zorder=4, **edge))
     low, high = bottom - glass - 2.6, float(wall[:, 1].max()) + 7.0
-    left, right = float(min(moved[:, 0].min(), -half)), float(max(moved[:, 0].max(), half))
+    left, right = moved[:, 0].min() - 3, max(moved[:, 0].max() + 6, half + 23.5)  # keeps the names inside
     box = axes.get_window_extent()
-    spare = max(0.0, (high - low) * box.width / box.height - (right - left + 9)) / 2  # keeps the names inside
-    axes.set_xlim(left - 3 - spare, right + 6 + spare)
+    spare = max(0.0, (high - low) * box.width / box.height - (right - left)) / 2
+    axes.set_xlim(left - spare, right + spare)
     axes.set_ylim(low, high)
     _name_the_parts(axes, frame, bottom, wall)
     axes.set_aspect("equal", anchor="N")
@@ -61,8 +61,10 @@ def draw_cut(axes: Axes, frame: Pictured, letter: str) -> None:
     axes.set_ylabel("z, mm (into the tissue)")
     indentation = frame.press["indentation_mm"]
     y = 0.0 if frame.inclusion is None else frame.inclusion.offset[1]
-    where = f"through the inclusion, y = {y:g} mm," if y else "at y = 0"
-    axes.set_title(f"{letter}  Cut {where} under a press of {indentation:.2f} mm (true scale)")
+    title = f"Cut at y = 0 under a press of {indentation:.2f} mm (deformation × 1)"
+    if y:
+        title = f"Cut through the inclusion (y = {y:g} mm), pressed {indentation:.2f} mm"
+    axes.set_title(f"{letter}  {title}")
 
 
 def _wall(frame: Pictured, moved: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -174,7 +176,7 @@ def draw_profiles(rows: Sequence[Axes], frame: Pictured, letter: str) -> None:
     inner = np.abs(points[:, :2]).max(axis=1) < INNER * half
     rows[1].set_ylim(0, 1.15 * max(pressure[inner].max(), pressure_0[inner].max()))
     rows[1].set_ylabel("pressure\nkPa", fontsize=6.5)
-    rows[1].legend(fontsize=6, frameon=False, loc="lower center", ncols=2, handlelength=2.2, borderpad=0)
+    rows[1].legend(fontsize=6, frameon=False, loc="best", ncols=2, handlelength=2.2, borderpad=0)
 
     counts = np.asarray(frame.tared, np.float64)
     row = round((0.5 - y / camera.field_height_mm) * counts.shape[0])  # rows grow with -y
@@ -197,7 +199,7 @@ def draw_profiles(rows: Sequence[Axes], frame: Pictured, letter: str) -> None:
             )
         if axes is not rows[2]:
             axes.tick_params(labelbottom=False)
-    what = f"What the inclusion adds, along y = {y:g}{' mm' if y else ''} (shaded: inclusion)"
+    what = f"What the inclusion (shaded) adds along y = {y:g}{' mm' if y else ''}"
     rows[0].set_title(f"{letter}  {what if found is not None else 'Along y = 0, on plain tissue'}")
 
 

@@ -156,7 +156,7 @@ def _facts(axes: Axes, frame: Pictured, letter: str) -> None:
         ("force", f"{frame.press['force_N']:.4f} N"),
         ("lowest contact pressure", f"{fem['min_pressure_kPa']:.3f} kPa"),
         ("mechanics", mechanics_in_words(fem)),
-        ("estimated error of the tared displacement", f"{fem['error_percent']:.2g} % of its maximum"),
+        ("error estimate, tared surface", f"{fem['error_percent']:.2g} % of its maximum"),
         ("unknowns of the mechanics", _number(fem["dof"])),
         ("LEDs", _coupling(frame)),
         ("noise of the computed light", f"{tsis['noise_percent']:.2f} % of its mean (rms)"),

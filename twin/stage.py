@@ -79,10 +79,11 @@ def check_file(name: str, field: str, suffix: str) -> Path:
     if not name.endswith(suffix) or target.name == suffix:
         raise DesignError(field, shown(name), f"the name of a file that ends in {suffix}")
     try:
-        if target.exists() and not target.is_file():
-            raise DesignError(field, f"{shown(name)}, which is not a file", f"a file that ends in {suffix}")
+        taken = target.exists() and not target.is_file()
     except (OSError, ValueError) as error:
         raise DesignError(field, shown(name), f"a file that can be made ({_reason(error)})") from None
+    if taken:
+        raise DesignError(field, f"{shown(name)}, which is not a file", f"a file that ends in {suffix}")
     return target
 
 
