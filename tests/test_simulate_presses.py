@@ -1,4 +1,4 @@
-"""Presses that are not straight down on the middle: tilted, off the centre, finite strain; their light too."""
+"""Presses that are not straight down on the middle: tilted, off the centre, finite strain; and light."""
 
 import dataclasses
 import json
@@ -62,12 +62,13 @@ def test_the_record_tells_the_pose_and_how_far_to_trust_it(tilted, tmp_path, cap
 
 
 def test_light_of_contact_that_has_opened(variant):
-    """A closed disc of 6 mm under even pressure: light comes out of it, and next to none from beside it."""
+    """Hertz's pressure on a disc of 6 mm radius: light comes out of it, and next to none from beside it."""
     from scenes import Renderer
 
-    surface = pressed(
-        lambda x, y: 1.5 * (np.hypot(x, y) < 6.0), lambda x, y: (0 * x, 0 * x, -0.2 * (np.hypot(x, y) < 6.0))
-    )
+    def dip(x, y):
+        return np.sqrt(np.maximum(1 - (x**2 + y**2) / 36, 0.0))
+
+    surface = pressed(lambda x, y: 1.5 * dip(x, y), lambda x, y: (0 * x, 0 * x, -0.2 * dip(x, y)))
     sensor = paper_sensor(columns=96, rows=61, pixel_um=(67.2, 78.4))
     found = Renderer(sensor, device="cpu").render(surface, quality="preview", seed=1)
     picture, place = found.radiance.sum(axis=0), np.hypot(*np.moveaxis(found.position_mm, -1, 0))

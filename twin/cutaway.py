@@ -153,7 +153,7 @@ def draw_profiles(rows: Sequence[Axes], frame: Pictured, letter: str) -> None:
     points = np.asarray(frame.surface.points, float)
     half, camera = frame.design.waveguide.width_mm / 2, frame.design.camera
     y = 0.0 if found is None else found.offset[1]
-    y = float(np.clip(y, -0.45 * camera.field_height_mm, 0.45 * camera.field_height_mm))
+    y = round(float(np.clip(y, -0.45 * camera.field_height_mm, 0.45 * camera.field_height_mm)), 2)
     nodes = np.flatnonzero(np.abs(points[:, 1] - y) < 1e-6 * half)
     x = np.linspace(-half, half, 401)[1:-1]
 

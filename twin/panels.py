@@ -156,6 +156,7 @@ def draw_tared(axes: Axes, frame: Pictured, letter: str) -> None:
         lines.append(f"solid: {k:g} counts")
     if frame.inclusion is not None:
         _outline(axes, frame, INK)
+        axes.set(xlim=extent[:2], ylim=extent[2:])  # whatever of the inclusion lies beyond the picture
         lines.append("dashed: inclusion")
     scale_bar(axes, extent[0] + 1, extent[2] + 1, 5.0, INK)
     axes.set_xticks([])

@@ -104,11 +104,11 @@ def _headline(figure: Figure, frame: Pictured) -> None:
     what = "Plain tissue, no inclusion"
     if found is not None:
         what = f"Inclusion {inclusion_in_words(found)}"
-        if any(found.offset):
-            what += f", off centre by ({found.offset[0]:g}, {found.offset[1]:g}) mm"
     what += f", pressed {frame.press['indentation_mm']:.2f} mm"
     notes = [f"design {frame.design.name}", f"seed {frame.seed}", "computed, not photographed"]
     tilt, position = frame.press["tilt_deg"], frame.press["position_mm"]
+    if found is not None and any(found.offset):
+        notes.insert(0, f"inclusion off centre by ({found.offset[0]:g}, {found.offset[1]:g}) mm")
     if any(position):
         notes.insert(0, f"sensor at ({position[0]:g}, {position[1]:g}) mm of the specimen")
     if any(tilt):
