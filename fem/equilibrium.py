@@ -33,7 +33,8 @@ _NEWTON = 25  # steps at most
 _PATIENCE = 12  # steps after which the residual must have come down to a hundredth of the reaction
 _WORTH = 15  # iterations of conjugate gradients that are worth a new factor
 _CHUNK = 128  # element matrices made double at a time
-_TURNS, _RELAX = 4, 0.6
+_TURNS, _RELAX = 5, 0.7
+_LOOSE = 3e-4  # tolerance while the tie still changes
 _TURN = 1e-3  # change of the contact's slope that is left, in shares of the largest force
 _SETS = 40  # changes of the active set at most
 
@@ -127,7 +128,6 @@ class Stiffness:
             hit = self.other[np.minimum(at, len(self.other) - 1)] == elements
             found[hit] = self.instead[at[hit]]
         return found
-
 
     def sheared(self, cells: Ints, slope: Floats) -> Stiffness:
         """In the unknowns x, y and z - G . (x, y) at each node; slope G (nodes, 2)."""
@@ -240,22 +240,22 @@ def equilibrium(body: Body, guess: State) -> State:
     held = model.nodes.held
     state.moved[held] = np.where(held, model.chest(guess.indentation), 0.0)[held]
     seen: set[bytes] = set()
-    turns = 0
+    turns, held_fast = 0, not model.finite
     for _ in range(_SETS):
-        if model.finite:
+        if not held_fast:
             share = 1.0 if turns == 0 else _RELAX
             state = replace(state, tie=tie(model.interface, model.place + state.moved, state.tie, share))
             turns += 1
         before = state.force
-        state = _newton(body, state)
+        state = _newton(body, state, _TOLERANCE if held_fast else _LOOSE)
         off = float(np.abs(state.force - before).max(initial=0.0))
         distance = state.tie.gap(model.place + state.moved)
         pulls = state.closed & (state.force < 0)
         overlaps = ~state.closed & (distance < 0)
         if not (pulls.any() or overlaps.any()):
-            settled = off <= _TURN * float(np.abs(state.force).max(initial=0.0))
-            if not model.finite or settled or turns >= _TURNS:
+            if held_fast:
                 return state
+            held_fast = turns >= _TURNS or off <= _TURN * float(np.abs(state.force).max(initial=0.0))
             continue
         closed = (state.closed & ~pulls) | overlaps
         key = closed.tobytes()
@@ -272,7 +272,7 @@ def equilibrium(body: Body, guess: State) -> State:
     raise NotConverged("the set of closed contact pairs does not settle")
 
 
-def _newton(body: Body, start: State) -> State:
+def _newton(body: Body, start: State, tolerance: float) -> State:
     """Equilibrium for a given set of closed pairs and slopes."""
     model, closed, moved, bond = start.model, start.closed, start.moved, start.tie
     sys = model.system(closed)
@@ -284,7 +284,7 @@ def _newton(body: Body, start: State) -> State:
         normal = np.where(closed, forces[tip, 2], 0.0)
         residual = sys.gather(bond.hand_on(forces, normal))
         size, scale = float(np.linalg.norm(residual)), float(np.linalg.norm(forces[at_chest]))
-        if size <= max(_TOLERANCE * scale, body.floor):
+        if size <= max(tolerance * scale, body.floor):
             return replace(start, moved=moved, force=-normal, chest=-forces[at_chest].sum(axis=0))
         if turn >= _PATIENCE and size > 1e-2 * scale:
             raise NotConverged("Newton's method does not come down")

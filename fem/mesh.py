@@ -45,9 +45,7 @@ class Geometry:
             res = Resolution(**{**res.__dict__, "side": 0})
         offset = (0.0, 0.0) if self.inclusion is None else self.inclusion.offset
         turned = self.pose.tilt_deg[::-1]  # a turn about y breaks the symmetry in x
-        broken = [
-            any((o, p, t)) for o, p, t in zip(offset, self.pose.position_mm, turned, strict=True)
-        ]
+        broken = [any((o, p, t)) for o, p, t in zip(offset, self.pose.position_mm, turned, strict=True)]
         return Layout(res, len(self.probe.layers), (not broken[0], not broken[1]))
 
 
@@ -217,7 +215,10 @@ def morph_slab(layout: Layout, geometry: Geometry, shift: Floats | None = None) 
     blend = np.clip((p[2] + res.reach + res.above) / res.above, 0, 1)
     real = np.stack(
         [
-            *((1 - blend) * box.surface[k].lines(p[k], res) + blend * box.deep[k].lines(p[k], res) for k in (0, 1)),
+            *(
+                (1 - blend) * box.surface[k].lines(p[k], res) + blend * box.deep[k].lines(p[k], res)
+                for k in (0, 1)
+            ),
             np.interp(p[2], knots, heights),
         ]
     )
@@ -238,7 +239,10 @@ def _extended(layout: Layout, shift: Floats, logical: Floats) -> Floats:
     padding = []
     for symmetric in layout.symmetric:
         half = np.concatenate(
-            [res.reach * np.arange(2 * res.arc + 1) / (2 * res.arc), res.reach + np.arange(1, 2 * res.edge + 1) / 2]
+            [
+                res.reach * np.arange(2 * res.arc + 1) / (2 * res.arc),
+                res.reach + np.arange(1, 2 * res.edge + 1) / 2,
+            ]
         )
         # a symmetry plane is no side: the field goes on beyond it
         lines.append(np.concatenate([half if symmetric else _mirrored(half), [side]]))

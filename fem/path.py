@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fem import elasticity, mesh, solver
+from fem import elasticity, mesh
 from fem.contact import Interface, level, line
 from fem.elasticity import Inverted
 from fem.equilibrium import Body, Model, NotConverged, State, Stiffness, equilibrium, product
@@ -181,7 +181,11 @@ class Path:
     def _line(self, near: State, indentation: float) -> list[State]:
         """Up to three states to extrapolate from, none of them nearer to the next than the way to go."""
         known, way = [near], abs(indentation - near.indentation)
-        behind = [s for s in self.states if (s.indentation - near.indentation) * (indentation - near.indentation) < 0]
+        behind = [
+            s
+            for s in self.states
+            if (s.indentation - near.indentation) * (indentation - near.indentation) < 0
+        ]
         for state in sorted(behind, key=lambda s: abs(s.indentation - near.indentation)):
             if abs(state.indentation - known[-1].indentation) >= 0.99 * way and len(known) < 3:
                 known.append(state)

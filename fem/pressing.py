@@ -16,7 +16,7 @@ from fem.equilibrium import NotConverged as Stuck
 from fem.equilibrium import State
 from fem.mesh import Geometry
 from fem.model import Inclusion, NotConverged, NotModelled, Pose, Probe, Slab, check
-from fem.path import Path, build, moduli, path
+from fem.path import build, moduli, path
 from fem.solver import one_thread
 from fem.topology import Resolution, materials, probe_topology, slab_topology
 from fem.trust import discretisation_error
@@ -236,9 +236,7 @@ def press_moduli(
     levels, _, _ = _levels(indentation, None)
     _known("quality", quality, mesh.QUALITIES)
     _known("mechanics", mechanics, MECHANICS)
-    several = [
-        _geometry(probe, slab, replace(inclusion, modulus=float(m)), tilt, position) for m in moduli
-    ]
+    several = [_geometry(probe, slab, replace(inclusion, modulus=float(m)), tilt, position) for m in moduli]
     return list(_presses(several, levels, False, mechanics, mesh.QUALITIES[quality], estimate, progress))
 
 
@@ -311,7 +309,8 @@ def _presses(
                 found: dict[float, Press] = {}
                 for level in sorted(set(levels)):
                     states = tuple(
-                        p.by_force(1e3 * level / model.share) if by_force else p.to(level) for p in (full, bare)
+                        p.by_force(1e3 * level / model.share) if by_force else p.to(level)
+                        for p in (full, bare)
                     )
                     seconds = time.perf_counter() - start
                     found[level] = _press(geometry, states, mechanics, res, error, seconds)  # type: ignore[arg-type]

@@ -50,7 +50,9 @@ class Quadrature:
 
     def part(self, elements: Ints) -> Quadrature:
         """The same for some of the elements."""
-        return Quadrature(*(field[elements] for field in (self.nodes, self.inverse, self.weight, self.modes)))
+        return Quadrature(
+            self.nodes[elements], self.inverse[elements], self.weight[elements], self.modes[elements]
+        )
 
     @property
     def size(self) -> int:

@@ -80,7 +80,9 @@ def pressure(
     at_edge = [_edge_cells(line, edge) for line in (x, y)]
     loose = np.zeros(cells, dtype=bool) if closed is None else _around(~closed)
     number = np.arange(reaction.size).reshape(shape)
-    nine = np.stack([number[i : i + 2 * cells[0] : 2, j : j + 2 * cells[1] : 2] for i in range(3) for j in range(3)], -1)
+    nine = np.stack(
+        [number[i : i + 2 * cells[0] : 2, j : j + 2 * cells[1] : 2] for i in range(3) for j in range(3)], -1
+    )
     size_x, size_y = x[2::2] - x[:-2:2], y[2::2] - y[:-2:2]
     for _ in range(20):
         lump_x, lump_y = at_edge[0][:, None] | loose, at_edge[1][None, :] | loose

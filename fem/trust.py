@@ -11,7 +11,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from fem.equilibrium import State
 from fem.mesh import QUALITIES, Geometry
 from fem.path import Path, build, path
 from fem.topology import Resolution
@@ -60,7 +59,10 @@ def tared(geometry: Geometry, full: Path, bare: Path) -> Floats:
     field = -(rates[0] - rates[1])[nodes.tip][..., 2]
     at = model.place[nodes.tip]
     rows = []
-    for lines, symmetric in ((at[:, 0, 0], model.layout.symmetric[0]), (at[0, :, 1], model.layout.symmetric[1])):
+    for lines, symmetric in (
+        (at[:, 0, 0], model.layout.symmetric[0]),
+        (at[0, :, 1], model.layout.symmetric[1]),
+    ):
         places = np.abs(np.linspace(-half, half, _GRID)) if symmetric else np.linspace(-half, half, _GRID)
         rows.append(_interpolation(lines, places))
     return np.asarray(rows[0] @ field @ rows[1].T)
@@ -72,5 +74,9 @@ def _interpolation(lines: Floats, places: Floats) -> Floats:
     t = (places - lines[first]) / (lines[first + 2] - lines[first])
     rows = np.zeros((len(places), len(lines)))
     at = np.arange(len(places))
-    rows[at, first], rows[at, first + 1], rows[at, first + 2] = (1 - t) * (1 - 2 * t), 4 * t * (1 - t), t * (2 * t - 1)
+    rows[at, first], rows[at, first + 1], rows[at, first + 2] = (
+        (1 - t) * (1 - 2 * t),
+        4 * t * (1 - t),
+        t * (2 * t - 1),
+    )
     return rows
