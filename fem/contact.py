@@ -1,21 +1,22 @@
 """Frictionless contact by mortar: where the probe's faces stand on the slab's, and how forces reach it.
 
-Both bodies carry the same grid of nine-node faces, the probe's face by face on the slab's. The slab's mesh follows
-the expected slip (`fem.path`), so that what is left of it is small against a face, and each of the 3 x 3 Gauss
-points q of a face of the probe stands on the polynomial of its own partner, at xi where (x, y)_slab(xi) =
-(x, y)_q. Closed contact ties the z of the probe's node i to the slab's surface,
+Both bodies carry the same grid of nine-node faces, the probe's face by face on the slab's. The slab's mesh
+follows the expected slip (`fem.path`), so that what is left of it is small against a face, and each of the 3
+x 3 Gauss points q of a face of the probe stands on the polynomial of its own partner, at xi where (x,
+y)_slab(xi) = (x, y)_q. Closed contact ties the z of the probe's node i to the slab's surface,
 
-    z_i = sum_q P_iq (z_slab(xi_q) + G_q . ((x, y)_q - (x, y)_slab(xi_q))),  P_iq = w_q psi_i(q) / w_i,     (1)
+    z_i = sum_q P_iq (z_slab(xi_q) + G_q . ((x, y)_q - (x, y)_slab(xi_q))),  P_iq = w_q psi_i(q) / w_i,
+    (1)
 
-with the dual functions psi that are biorthogonal to the quadratic ones (Wohlmuth 2000; [wohlmuth2000]), so that
-without slip (1) says that pairs of nodes have the same z, and with the slope G of the probe's deformed face. The
-transpose of (1) hands on the forces: along the normal (-G, 1), at the very place of contact. That place counts:
-above an inclusion the tissue slides outwards under the probe by some 5 % of the indentation and would take the
-background's pressure along, which is a tenth of the signal per mm.
+with the dual functions psi that are biorthogonal to the quadratic ones (Wohlmuth 2000; [wohlmuth2000]), so
+that without slip (1) says that pairs of nodes have the same z, and with the slope G of the probe's deformed
+face. The transpose of (1) hands on the forces: along the normal (-G, 1), at the very place of contact. That
+place counts: above an inclusion the tissue slides outwards under the probe by some 5 % of the indentation and
+would take the background's pressure along, which is a tenth of the signal per mm.
 
-xi and G are held fixed while equilibrium is found, then taken anew until they stay (Wriggers 2006, section 6.3;
-[wriggers2006]): each equilibrium is that of two elastic bodies under linear ties, with an energy and a symmetric
-tangent. A pair is closed with a force >= 0, or open with a gap >= 0 (Signorini's conditions).
+xi and G are held fixed while equilibrium is found, then taken anew until they stay (Wriggers 2006, section
+6.3; [wriggers2006]): each equilibrium is that of two elastic bodies under linear ties, with an energy and a
+symmetric tangent. A pair is closed with a force >= 0, or open with a gap >= 0 (Signorini's conditions).
 """
 
 from __future__ import annotations
@@ -71,7 +72,8 @@ class Line:
     recovery: Floats  # derivatives at the nodes, (n, n)
 
     def rows(self, at: Floats, element: Ints) -> tuple[Floats, Floats]:
-        """Weights of the nodes for values and derivatives at places (m,) on the polynomials of elements (m,)."""
+        """Weights of the nodes for values and derivatives at places (m,) on the polynomials of elements
+        (m,)."""
         first = 2 * element
         step = self.nodes[first + 2] - self.nodes[first]
         local = _lagrange((at - self.nodes[first]) / step)
@@ -100,7 +102,8 @@ def line(nodes: Floats) -> Line:
 
 @dataclass(frozen=True)
 class Weights:
-    """Of the slab's nodes on the grid (nx, ny) at m places: of values and first derivatives along each axis."""
+    """Of the slab's nodes on the grid (nx, ny) at m places: of values and first derivatives along each
+    axis."""
 
     x: tuple[Floats, Floats]  # each (m, nx)
     y: tuple[Floats, Floats]  # each (m, ny)
@@ -200,7 +203,8 @@ class Tie:
         return self.height(place) - place[self.interface.probe, 2]
 
     def hand_on(self, forces: Floats, normal: Floats) -> Floats:
-        """Forces (nodes, 3) with those `normal` (nx, ny) along z on the probe's nodes handed on through (1)."""
+        """Forces (nodes, 3) with those `normal` (nx, ny) along z on the probe's nodes handed on through
+        (1)."""
         out, face = forces.copy(), self.interface
         out[face.probe, 2] -= normal
         at = face.spread_mean(normal)

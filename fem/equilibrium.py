@@ -1,9 +1,10 @@
-"""Equilibrium of probe and slab: Newton's method on the forces, conjugate gradients on the tangent, active set.
+"""Equilibrium of probe and slab: Newton's method on the forces, conjugate gradients on the tangent, active
+set.
 
 The tangent is applied element by element and never assembled; a Cholesky factor of an earlier tangent
-(`fem.solver`) preconditions it, so that most Newton steps need no factorisation at all. Which pairs of contact
-nodes are closed is iterated around it (primal-dual active set: Hüeber and Wohlmuth 2005; [hueber2005]): closed pairs
-that pull are opened, open pairs that overlap are closed, until neither is left.
+(`fem.solver`) preconditions it, so that most Newton steps need no factorisation at all. Which pairs of
+contact nodes are closed is iterated around it (primal-dual active set: Hüeber and Wohlmuth 2005;
+[hueber2005]): closed pairs that pull are opened, open pairs that overlap are closed, until neither is left.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """From logical to real coordinates: hexahedra that morph smoothly with the geometry.
 
-Sizes, depths, offsets and widths only enter here, so every inclusion shares one topology (`fem.topology`), and
-answers vary smoothly with the geometry. Under the contact surface the grid lines follow the inclusion; on the
-surface they stay within the probe's edges, and the layers between shear from one to the other.
+Sizes, depths, offsets and widths only enter here, so every inclusion shares one topology (`fem.topology`),
+and answers vary smoothly with the geometry. Under the contact surface the grid lines follow the inclusion; on
+the surface they stay within the probe's edges, and the layers between shear from one to the other.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 from skfem import ElementHex2, MeshHex2
 
-from fem.model import Inclusion, Pose, Probe, Slab
+from fem.model import STRAIGHT, Inclusion, Pose, Probe, Slab
 from fem.topology import Layout, Resolution, probe_topology, slab_topology
 
 Floats = NDArray[np.float64]
@@ -36,7 +36,7 @@ class Geometry:
     probe: Probe
     slab: Slab
     inclusion: Inclusion | None = None
-    pose: Pose = Pose()
+    pose: Pose = STRAIGHT
 
     def layout(self, res: Resolution) -> Layout:
         """The topology that the symmetry of this geometry allows; no cells beside a probe as wide as the
@@ -62,7 +62,8 @@ class Span:
     side_high: float
 
     def lines(self, logical: Floats, res: Resolution) -> Floats:
-        """Real coordinate of logical ones: even in the box, finer towards the probe's edge from both sides."""
+        """Real coordinate of logical ones: even in the box, finer towards the probe's edge from both
+        sides."""
         knots = np.concatenate([[0.0], res.reach + np.arange(res.edge + res.side + 1.0)])
 
         def half(box: float, edge: float, side: float) -> Floats:

@@ -46,7 +46,8 @@ def build(geometry: Geometry, res: Resolution, finite: bool, shift: Floats | Non
 
 
 def follow(geometry: Geometry, model: Model, shift: Floats) -> Model:
-    """The same model with the slab's contact nodes moved within its surface, to where the probe's nodes are."""
+    """The same model with the slab's contact nodes moved within its surface, to where the probe's nodes
+    are."""
     slab = mesh.morph_slab(model.layout, geometry, shift)
     quad, place, cut = quadrature(slab), model.place.copy(), model.nodes.slab_cells
     place[: model.nodes.slab] = slab.doflocs.T

@@ -267,7 +267,7 @@ def _levels(
         )
     name, given = ("indentation", indentation) if force is None else ("force", force)
     several = np.ndim(given) > 0  # type: ignore[arg-type]
-    levels = [float(level) for level in (given if several else [given])]  # type: ignore[union-attr, list-item, arg-type]
+    levels = [float(level) for level in (given if several else [given])]  # type: ignore[union-attr, arg-type]
     for level in levels:
         if not (np.isfinite(level) and level > 0):
             raise ValueError(f"{name}: received {level}; allowed are positive finite numbers")

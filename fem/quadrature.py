@@ -1,4 +1,5 @@
-"""Quadrature of the 27-node hexahedron on curved elements: 27 Gauss points, gradients, linear pressure modes."""
+"""Quadrature of the 27-node hexahedron on curved elements: 27 Gauss points, gradients, linear pressure
+modes."""
 
 from __future__ import annotations
 

@@ -57,10 +57,10 @@ def pressure(
     The consistent load of a pressure p is M p, with M the mass matrix of the contact faces. Dividing by the
     lumped area instead leaves an alternating error of -0.2 p'' H² at an element's corners and +0.1 p'' H² at
     its middle, H its half length: 3 % of the tared peak at standard quality. Solving with M removes it, but
-    rings next to the singularity at the probe's edge, and where contact ends. So M is consistent inside, lumped
-    (Simpson's rule) across the edge in the `edge` cells next to the probe's edge, and lumped around open pairs
-    and wherever it would still give a negative pressure. Its row sums are the lumped areas in any case, so
-    `pressure * area` sums to the force.
+    rings next to the singularity at the probe's edge, and where contact ends. So M is consistent inside,
+    lumped (Simpson's rule) across the edge in the `edge` cells next to the probe's edge, and lumped around
+    open pairs and wherever it would still give a negative pressure. Its row sums are the lumped areas in any
+    case, so `pressure * area` sums to the force.
 
     Parameters
     ----------

@@ -1,9 +1,9 @@
 """How far a press can be trusted: its discretisation error, estimated from a coarser mesh.
 
 The tared displacement of the contact surface is found once more on the next coarser mesh, by linear
-elasticity (whose discretisation error is nearly that of finite strain, at a fraction of the cost). Both meshes
-have the same topology but for their resolution, so the difference measures the coarser one's error, and a
-fixed share of it the finer one's (`SHARE`, measured; `tests/test_fem_trust.py`).
+elasticity (whose discretisation error is nearly that of finite strain, at a fraction of the cost). Both
+meshes have the same topology but for their resolution, so the difference measures the coarser one's error,
+and a fixed share of it the finer one's (`SHARE`, measured; `tests/test_fem_trust.py`).
 """
 
 from __future__ import annotations
