@@ -59,7 +59,22 @@ def export(
     target = check(design, inclusion, levels, kind, name)
     tell = progress or (lambda stage, done: None)
     with staged_file(name, kind, SUFFIXES[kind]) as path:
-        if kind == "vtu":
+        if kind == "ccx":
+            from fem import ccx
+
+            tell("file", 0.0)
+            ccx.deck(
+                path,
+                design.probe(),
+                design.slab(),
+                inclusion,
+                levels,
+                mechanics=design.mechanics,
+                quality=quality,
+                tilt=design.press.tilt_deg,
+                position=design.press.position_mm,
+            )
+        else:
             (press,) = presses.solved(
                 design,
                 inclusion,
