@@ -1,4 +1,4 @@
-"""What a design says of presses and inclusions: what fits under the sensor, in one plain line where it does not."""
+"""What a design says of presses and inclusions: what fits under the sensor, one line where it does not."""
 
 import dataclasses
 import re
