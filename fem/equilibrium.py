@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import LinearOperator, cg
 
 from fem import elasticity, solver
-from fem.contact import Interface
+from fem.contact import Interface, Tie, tie
 from fem.elasticity import Inverted
 from fem.quadrature import DOFS, Quadrature
 from fem.system import Nodes, System, system
@@ -33,8 +33,7 @@ _NEWTON = 25  # steps at most
 _PATIENCE = 12  # steps after which the residual must have come down to a hundredth of the reaction
 _WORTH = 15  # iterations of conjugate gradients that are worth a new factor
 _CHUNK = 128  # element matrices made double at a time
-DEBUG = False
-_TURNS, _RELAX = 2, 0.6
+_TURNS, _RELAX = 4, 0.6
 _TURN = 1e-3  # change of the contact's slope that is left, in shares of the largest force
 _SETS = 40  # changes of the active set at most
 
@@ -77,9 +76,9 @@ class Model:
     def system(self, closed: Bools) -> System:
         return system(self.layout, self.sides, closed)
 
-    def settle(self, moved: Floats, closed: Bools, slope: Floats) -> None:
+    def settle(self, moved: Floats, closed: Bools, bond: Tie) -> None:
         """Put the probe's closed nodes onto the slab's surface, in place."""
-        distance = self.interface.gap(self.place + moved, slope)
+        distance = bond.gap(self.place + moved)
         moved[self.nodes.tip, 2] += np.where(closed, distance, 0.0)
 
     def nodal(self, forces: Floats) -> Floats:
@@ -99,7 +98,7 @@ class State:
     force: Floats  # of the probe on the slab along z at each pair, mN, positive pressing; (nx, ny)
     chest: Floats  # of the slab on the chest wall, (3,) mN
     model: Model  # the mesh it belongs to
-    slope: Floats  # of the surface in contact, (nx, ny, 2)
+    tie: Tie
 
 
 @dataclass
@@ -244,19 +243,18 @@ def equilibrium(body: Body, guess: State) -> State:
     turns = 0
     for _ in range(_SETS):
         if model.finite:
-            wish = model.interface.slope(model.place + state.moved)
-            state = replace(state, slope=wish if turns == 0 else _RELAX * wish + (1 - _RELAX) * state.slope)
-        state = _newton(body, state)
-        if model.finite:
-            new = model.interface.slope(model.place + state.moved)
-            off = float(np.abs((new - state.slope) * state.force[..., None]).max(initial=0.0))
+            share = 1.0 if turns == 0 else _RELAX
+            state = replace(state, tie=tie(model.interface, model.place + state.moved, state.tie, share))
             turns += 1
-            if DEBUG: print('    slopes', np.abs(new-state.slope).max(), off/np.abs(state.force).max(), body.effort)
-        distance = model.interface.gap(model.place + state.moved, state.slope)
+        before = state.force
+        state = _newton(body, state)
+        off = float(np.abs(state.force - before).max(initial=0.0))
+        distance = state.tie.gap(model.place + state.moved)
         pulls = state.closed & (state.force < 0)
         overlaps = ~state.closed & (distance < 0)
         if not (pulls.any() or overlaps.any()):
-            if not model.finite or off <= _TURN * float(np.abs(state.force).max(initial=0.0)) or turns >= _TURNS:
+            settled = off <= _TURN * float(np.abs(state.force).max(initial=0.0))
+            if not model.finite or settled or turns >= _TURNS:
                 return state
             continue
         closed = (state.closed & ~pulls) | overlaps
@@ -276,23 +274,23 @@ def equilibrium(body: Body, guess: State) -> State:
 
 def _newton(body: Body, start: State) -> State:
     """Equilibrium for a given set of closed pairs and slopes."""
-    model, closed, moved, slope = start.model, start.closed, start.moved, start.slope
+    model, closed, moved, bond = start.model, start.closed, start.moved, start.tie
     sys = model.system(closed)
-    face, tip, at_chest = model.interface, model.nodes.tip, model.nodes.chest
-    model.settle(moved, closed, slope)
+    tip, at_chest = model.nodes.tip, model.nodes.chest
+    model.settle(moved, closed, bond)
     forces, energy = body.forces(model, moved)
     renew = False
     for turn in range(_NEWTON):
         normal = np.where(closed, forces[tip, 2], 0.0)
-        residual = sys.gather(face.hand_on(forces, normal, slope))
+        residual = sys.gather(bond.hand_on(forces, normal))
         size, scale = float(np.linalg.norm(residual)), float(np.linalg.norm(forces[at_chest]))
         if size <= max(_TOLERANCE * scale, body.floor):
             return replace(start, moved=moved, force=-normal, chest=-forces[at_chest].sum(axis=0))
         if turn >= _PATIENCE and size > 1e-2 * scale:
             raise NotConverged("Newton's method does not come down")
         matrices = body.tangent(model, moved)
-        factor = body.factor(sys, matrices, face.nodal(slope, len(moved)), renew)
-        change, steps, downhill = _solve(body, model, sys, slope, matrices, factor, -residual)
+        factor = body.factor(sys, matrices, bond.slopes(len(moved)) if model.finite else None, renew)
+        change, steps, downhill = _solve(body, model, sys, bond, matrices, factor, -residual)
         renew = model.finite and steps > _WORTH
         body.effort.newton += 1
         # far from equilibrium, no step may raise the energy (Armijo's rule); near it rounding would decide
@@ -314,18 +312,18 @@ def _solve(
     body: Body,
     model: Model,
     sys: System,
-    slope: Floats,
+    bond: Tie,
     matrices: Stiffness,
     factor: Preconditioner,
     load: Floats,
 ) -> tuple[Floats, int, float]:
     """Change of the displacements (nodes, 3) that a load on the unknowns makes, the iterations taken, and
     the work of the load."""
-    face, tip = model.interface, model.nodes.tip
+    tip = model.nodes.tip
 
     def expand(values: Floats) -> Floats:
         change = sys.expand(values)
-        change[tip, 2] = np.where(sys.closed, face.height(change, slope), change[tip, 2])
+        change[tip, 2] = np.where(sys.closed, bond.height(change), change[tip, 2])
         return change
 
     if not model.finite:
@@ -334,7 +332,7 @@ def _solve(
 
     def apply(values: Floats) -> Floats:
         force = model.nodal(product(matrices, expand(values), model))
-        return sys.gather(face.hand_on(force, np.where(sys.closed, force[tip, 2], 0.0), slope))
+        return sys.gather(bond.hand_on(force, np.where(sys.closed, force[tip, 2], 0.0)))
 
     count = [0]
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fem import elasticity, mesh, solver
-from fem.contact import Interface, recovery
+from fem.contact import Interface, level, line
 from fem.elasticity import Inverted
 from fem.equilibrium import Body, Model, NotConverged, State, Stiffness, equilibrium, product
 from fem.mesh import Geometry
@@ -35,7 +35,7 @@ def build(geometry: Geometry, res: Resolution, finite: bool, shift: Floats | Non
         layout,
         geometry.slab.sides,
         found,
-        Interface(found.contact, found.tip, recovery(x), recovery(y), layout.symmetric),
+        Interface(found.contact, found.tip, line(x), line(y), layout.symmetric),
         join([quadrature(slab), quadrature(probe)]),
         place,
         np.zeros((*found.tip.shape, 2)) if shift is None else shift,
@@ -232,11 +232,11 @@ def path(geometry: Geometry, model: Model, inclusion: bool, beside: Path | None 
         rest = replace(beside.body.rest, other=model.ball, instead=ball)
     body = Body(shear, bulk, rest, model.finite, inclusion, {} if beside is None else beside.body.factors)
     still = np.zeros_like(model.place)
-    level = np.zeros((*model.nodes.tip.shape, 2))
-    clearance = model.interface.gap(model.place, level)
+    bond = level(model.interface)
+    clearance = bond.gap(model.place)
     flat = bool(np.abs(clearance).max() < 1e-9)
     start = 0.0 if flat else float(clearance.min() / model.normal[2])
     closed = np.full(clearance.shape, flat)
     apart = still - start * model.normal * model.slab
-    nothing = State(start, apart, closed, np.zeros(closed.shape), np.zeros(3), model, level)
+    nothing = State(start, apart, closed, np.zeros(closed.shape), np.zeros(3), model, bond)
     return Path(geometry, body, [nothing], beside)
