@@ -46,7 +46,6 @@ _FLAGS = {
     "press.position_mm": "--position",
     "mechanics": "--mechanics",
     "vtu": "--vtu",
-    "ccx": "--ccx",
     "out": "--out",
     "device": "--device",
 }
@@ -143,10 +142,10 @@ def _simulate(
 def _export(arguments: argparse.Namespace, design: Design, inclusion: fem.Inclusion | None) -> None:
     from twin import export
 
-    name = arguments.ccx if arguments.vtu is None else arguments.vtu
-    if name is None:
-        raise DesignError("--vtu, --ccx", "nothing", "one of them, with the file to write")
-    kind: export.Kind = "ccx" if arguments.vtu is None else "vtu"
+    if arguments.vtu is None:
+        raise DesignError("--vtu", "nothing", "the file to write")
+    kind: export.Kind = "vtu"
+    name = arguments.vtu
     levels = arguments.indentation or design.press.indentation_mm
     export.check(design, inclusion, levels, kind, name)
     from twin.reporting import Reporter

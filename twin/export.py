@@ -1,9 +1,8 @@
-"""A press as a file for other programs: volume results for ParaView, an input deck for CalculiX."""
+"""A press as a file for other programs: volume results for ParaView."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
@@ -14,9 +13,9 @@ from twin.design import Design
 from twin.presses import Quality
 from twin.stage import check_file, staged_file
 
-Kind = Literal["vtu", "ccx"]
+Kind = Literal["vtu"]
 
-SUFFIXES: dict[str, str] = {"vtu": ".vtu", "ccx": ".inp"}
+SUFFIXES: dict[str, str] = {"vtu": ".vtu"}
 
 
 def check(
@@ -25,16 +24,8 @@ def check(
     """Return the absolute path of the file, or raise `DesignError` before any work is done."""
     target = check_file(name, kind, SUFFIXES[kind])
     presses.check(design, inclusion, levels)
-    received = shown(list(levels))
     if kind == "vtu" and len(levels) != 1:
-        raise DesignError("press.indentation_mm", received, "one depth for one .vtu file")
-    if any(deeper <= depth for depth, deeper in pairwise(levels)):
-        raise DesignError("press.indentation_mm", received, "depths that rise, each a step of the deck")
-    bent = any(design.press.tilt_deg) or design.waveguide.dome_radius_mm is not None
-    if kind == "ccx" and design.mechanics == "linear" and bent:
-        raise DesignError(
-            "mechanics", "'linear' with a tilt or a dome", "'finite' (a linear deck ties flat surfaces)"
-        )
+        raise DesignError("press.indentation_mm", shown(list(levels)), "one depth for one .vtu file")
     return target
 
 
@@ -52,23 +43,22 @@ def export(
 
     Parameters
     ----------
-    levels : depths of the press, mm: one for ``"vtu"``, rising ones for ``"ccx"``, which solves nothing here.
-    kind : ``"vtu"`` (see `fem.volume`) or ``"ccx"`` (see `fem.ccx`).
-    name : path of the file, ending in ``.vtu`` or ``.inp``.
+    levels : depth of the press, mm: one for ``"vtu"``.
+    kind : ``"vtu"`` (see `fem.volume`).
+    name : path of the file, ending in ``.vtu``.
     """
     target = check(design, inclusion, levels, kind, name)
     tell = progress or (lambda stage, done: None)
     with staged_file(name, kind, SUFFIXES[kind]) as path:
-        if kind == "vtu":
-            (press,) = presses.solved(
-                design,
-                inclusion,
-                levels,
-                quality=quality,
-                estimate=False,
-                progress=lambda stage, share: tell("mechanics", 0.9 * share),
-            )
-            tell("file", 0.9)
-            fem.save_volume(press.volume(), path)
+        (press,) = presses.solved(
+            design,
+            inclusion,
+            levels,
+            quality=quality,
+            estimate=False,
+            progress=lambda stage, share: tell("mechanics", 0.9 * share),
+        )
+        tell("file", 0.9)
+        fem.save_volume(press.volume(), path)
     tell("file", 1.0)
     return target
