@@ -181,7 +181,8 @@ def check(probe: Probe, slab: Slab, inclusion: Inclusion | None, pose: Pose = ST
     if away > 0 and away > room - 0.02 * slab.width_mm:
         raise NotModelled(
             f"position: received ({pose.position_mm[0]:g}, {pose.position_mm[1]:g}) mm; "
-            f"not modelled: a probe at or over the slab's side, allowed up to {max(0.0, room - 0.02 * slab.width_mm):g} mm"
+            f"not modelled: a probe at or over the slab's side, "
+            f"allowed up to {max(0.0, room - 0.02 * slab.width_mm):g} mm"
         )
     if any(pose.tilt_deg) and slab.sides == "symmetric":
         raise NotModelled(
