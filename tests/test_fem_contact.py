@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 import fem
 from fem.pressing import Mechanics
 
+pytestmark = pytest.mark.slow  # presses on full meshes
+
 Floats = NDArray[np.float64]
 
 LAYERS = (fem.Layer(2, 27), fem.Layer(3, 61), fem.Layer(5, 156))

@@ -42,6 +42,7 @@ def random_motion(mesh: MeshHex2, seed: int) -> Floats:
     return np.asarray(place @ (0.2 * rng.normal(size=(3, 3))) + 0.005 * rng.normal(size=place.shape))
 
 
+@pytest.mark.slow
 def test_forces_are_the_derivative_of_the_energy() -> None:
     mesh, quad, shear, bulk = block()
     moved, way = random_motion(mesh, 1), np.random.default_rng(2).normal(size=(mesh.doflocs.shape[1], 3))
@@ -51,6 +52,7 @@ def test_forces_are_the_derivative_of_the_energy() -> None:
     assert found == pytest.approx((energy[0] - energy[1]) / (2 * h), rel=1e-7)
 
 
+@pytest.mark.slow
 def test_tangent_is_the_derivative_of_the_forces() -> None:
     mesh, quad, shear, bulk = block()
     moved, way = random_motion(mesh, 1), np.random.default_rng(2).normal(size=(mesh.doflocs.shape[1], 3))
@@ -62,6 +64,7 @@ def test_tangent_is_the_derivative_of_the_forces() -> None:
     np.testing.assert_allclose(found, expected, atol=1e-7 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 def test_rotation_turns_forces_and_keeps_the_energy() -> None:
     mesh, quad, shear, bulk = block()
     moved, place = random_motion(mesh, 3), mesh.doflocs.T
@@ -133,6 +136,7 @@ def test_levels_on_the_way_are_single_presses(levels: list[fem.Press]) -> None:
     assert np.abs(tared(levels[1]) - tared(alone)).max() < 1e-4 * np.abs(tared(alone)).max()
 
 
+@pytest.mark.slow
 def test_press_by_force() -> None:
     answer = fem.press(PROBE, SLAB, BALL, force=0.5, quality="preview", estimate=False)
     assert answer.force_N == pytest.approx(0.5, rel=1e-8)

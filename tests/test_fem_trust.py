@@ -12,6 +12,8 @@ from fem.path import Path, build, path
 from fem.topology import Resolution
 from fem.trust import discretisation_error, tared
 
+pytestmark = pytest.mark.slow  # presses on full meshes
+
 PROBE = fem.Probe(25, (fem.Layer(2, 27), fem.Layer(3, 61), fem.Layer(5, 156)))
 SLAB = fem.Slab(30, 60, 5)
 CASES = [(10, 5), (4, 6), (13, 4), (6, 8), (8, 3), (5, 10)]  # size, depth, mm
