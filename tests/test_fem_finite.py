@@ -42,7 +42,6 @@ def random_motion(mesh: MeshHex2, seed: int) -> Floats:
     return np.asarray(place @ (0.2 * rng.normal(size=(3, 3))) + 0.005 * rng.normal(size=place.shape))
 
 
-@pytest.mark.slow
 def test_forces_are_the_derivative_of_the_energy() -> None:
     mesh, quad, shear, bulk = block()
     moved, way = random_motion(mesh, 1), np.random.default_rng(2).normal(size=(mesh.doflocs.shape[1], 3))
@@ -52,7 +51,6 @@ def test_forces_are_the_derivative_of_the_energy() -> None:
     assert found == pytest.approx((energy[0] - energy[1]) / (2 * h), rel=1e-7)
 
 
-@pytest.mark.slow
 def test_tangent_is_the_derivative_of_the_forces() -> None:
     mesh, quad, shear, bulk = block()
     moved, way = random_motion(mesh, 1), np.random.default_rng(2).normal(size=(mesh.doflocs.shape[1], 3))
@@ -64,7 +62,6 @@ def test_tangent_is_the_derivative_of_the_forces() -> None:
     np.testing.assert_allclose(found, expected, atol=1e-7 * np.abs(expected).max())
 
 
-@pytest.mark.slow
 def test_rotation_turns_forces_and_keeps_the_energy() -> None:
     mesh, quad, shear, bulk = block()
     moved, place = random_motion(mesh, 3), mesh.doflocs.T
@@ -131,6 +128,7 @@ def test_a_press_balances(levels: list[fem.Press]) -> None:
         assert answer.mechanics == "finite"
 
 
+@pytest.mark.slow
 def test_levels_on_the_way_are_single_presses(levels: list[fem.Press]) -> None:
     alone = fem.press(PROBE, SLAB, BALL, 2.0, quality="preview", estimate=False)
     assert np.abs(tared(levels[1]) - tared(alone)).max() < 1e-4 * np.abs(tared(alone)).max()
