@@ -21,6 +21,7 @@ from fem.quadrature import DOFS, NODES, Quadrature
 
 Floats = NDArray[np.float64]
 
+_GUARD = 50.0
 _CHUNK = 128  # elements at a time: their temporaries stay in the cache
 
 
@@ -103,8 +104,10 @@ def forces(quad: Quadrature, moved: Floats, shear: Floats, bulk: Floats) -> tupl
         gradient, f, inverse, det = _deform(quad, part, moved)
         stress, mean = _deviator(f, det, shear[part])
         pressure = _pressure(quad, part, det, bulk[part])
+        guard = _GUARD * shear[part][:, None] * (det - 1) ** 3
         # half p (J - 1) integrates to the projected energy, since p is in the space projected onto
-        stored = 1.5 * (mean - shear[part][:, None]) + 0.5 * pressure * (det - 1)
+        stored = 1.5 * (mean - shear[part][:, None]) + (0.5 * pressure + 0.25 * guard) * (det - 1)
+        pressure += guard
         energy += float((quad.weight[part] * stored).sum())
         stress += (pressure * det)[..., None, None] * np.eye(3)
         # first Piola-Kirchhoff stress P = tau F^-T, weighted
@@ -156,7 +159,8 @@ def _stiffness(
     n, q = det.shape
     weight = quad.weight[part]
     stress, mean = _deviator(f, det, shear)
-    pressure = _pressure(quad, part, det, bulk) * det
+    pressure = (_pressure(quad, part, det, bulk) + _GUARD * shear[:, None] * (det - 1) ** 3) * det
+    guard = 3 * _GUARD * shear[:, None] * ((det - 1) * det) ** 2
     kind = out.dtype
     # spatial gradients g = F^-T grad N: (n, 27, 3, q), then flat as (n, 81, q), dof = 3 * node + axis
     spatial = np.einsum("nqba,nbiq->niaq", inverse, gradient, optimize=True)
@@ -170,8 +174,8 @@ def _stiffness(
     # (mean - pJ) g_ib g_ja
     crossed = (flat * (weight * (mean - pressure))[:, None].astype(kind)) @ flat.transpose(0, 2, 1)
     k = crossed.reshape(n, NODES, 3, NODES, 3).transpose(0, 1, 4, 3, 2).reshape(n, DOFS, DOFS)
-    # h_ia g_jb + g_ia h_jb with h = (-2/3 tau_dev + (pJ - 2/3 mean)/2) g
-    tensor = (-2 / 3) * stress + (0.5 * (pressure - (2 / 3) * mean))[..., None, None] * np.eye(3)
+    # h_ia g_jb + g_ia h_jb with h = (-2/3 tau_dev + (pJ - 2/3 mean + J² dq/dJ)/2) g
+    tensor = (-2 / 3) * stress + (0.5 * (pressure - (2 / 3) * mean + guard))[..., None, None] * np.eye(3)
     h = np.einsum("nqab,nibq->niaq", tensor * weight[..., None, None], spatial, optimize=True)
     mixed = h.reshape(n, DOFS, q).astype(kind) @ flat.transpose(0, 2, 1)
     k = k + mixed + mixed.transpose(0, 2, 1)

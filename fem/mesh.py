@@ -223,7 +223,7 @@ def morph_slab(layout: Layout, geometry: Geometry, shift: Floats | None = None) 
             np.interp(p[2], knots, heights),
         ]
     )
-    if shift is not None and res.side:
+    if shift is not None:
         real[:2] += (1 - blend) * _extended(layout, shift, p)
     inside = np.abs(p).max(axis=0) < res.reach - 1e-9
     real[:, inside] = _o_grid(p[:, inside], res, box)
