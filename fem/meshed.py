@@ -63,15 +63,27 @@ class Model:
         total = np.bincount(dofs, weights=forces.ravel(), minlength=self.place.size)
         return np.asarray(total, dtype=float).reshape(-1, 3)
 
+    def wanted(self, moved: Floats) -> Floats:
+        """The `shift` that brings the slab's nodes opposite the probe's, for displacements (nodes, 3).
+
+        What runs along the probe's edge goes on into the faces there as it is before them: what the soft
+        corners do alone is not followed. A slab no wider than the probe keeps its edges.
+        """
+        shift = self.shift + self.interface.slip(self.place + moved)
+        for axis in (0, 1):
+            found = np.moveaxis(shift, axis, 0)  # a view: lines across this axis first
+            along = found[..., 1 - axis]
+            for end, symmetric in ((-1, False), (0, self.layout.symmetric[axis])):
+                if symmetric:
+                    continue
+                edge, before = (slice(-2, None), -3) if end else (slice(0, 2), 2)
+                along[edge] = along[before]
+                if not self.layout.res.side:
+                    found[end, :, axis] = 0.0
+        return shift
+
     def follow(self, shift: Floats) -> Model:
         """The same with the slab's contact nodes at another place within the slab's stress-free surface."""
-        if not self.layout.res.side:  # a slab no wider than the probe keeps its edges
-            shift = shift.copy()
-            shift[-1, :, 0] = shift[:, -1, 1] = 0.0
-            if not self.layout.symmetric[0]:
-                shift[0, :, 0] = 0.0
-            if not self.layout.symmetric[1]:
-                shift[:, 0, 1] = 0.0
         slab = mesh.morph_slab(self.layout, self.geometry, shift)
         quad, place, cut = quadrature(slab), self.place.copy(), self.nodes.slab_cells
         place[: self.nodes.slab] = slab.doflocs.T

@@ -75,7 +75,7 @@ class Path:
         if len(known) == 1 and near.closed.all():
             way = indentation - near.indentation
             moved = near.moved + self.rate() * way
-            shift = near.model.shift + near.model.interface.slip(self.rate()) * way
+            shift = near.model.wanted(moved)
         elif len(known) == 1 and near.model.finite:  # nothing touches yet: begin where small strain ends
             if self.linear is None:
                 small = replace(near.model, finite=False)

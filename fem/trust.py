@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fem.mesh import QUALITIES, Geometry
-from fem.path import Path, build, path
+from fem.meshed import build
+from fem.path import Path, path
 from fem.topology import Resolution
 
 Floats = NDArray[np.float64]
