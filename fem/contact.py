@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
 
 
 def recovery(lines: Floats) -> Floats:
@@ -65,6 +66,15 @@ class Interface:
         if self.symmetric[1]:
             found[:, 0, 1] = 0.0
         return np.asarray(found)
+
+    @property
+    def inner(self) -> Bools:
+        """Pairs off the faces along the probe's edge, (nx, ny)."""
+        x, y = (
+            (np.arange(n) < n - 3) & (half | (np.arange(n) > 2))
+            for n, half in zip(self.slab.shape, self.symmetric, strict=True)
+        )
+        return np.asarray(x[:, None] & y)
 
     def slip(self, place: Floats) -> Floats:
         """How far the probe's nodes lie beside their partners at places (nodes, 3); (nx, ny, 2) mm."""

@@ -66,18 +66,20 @@ class Model:
     def wanted(self, moved: Floats) -> Floats:
         """The `shift` that brings the slab's nodes opposite the probe's, for displacements (nodes, 3).
 
-        What runs along the probe's edge goes on into the faces there as it is before them: what the soft
-        corners do alone is not followed. A slab no wider than the probe keeps its edges.
+        In the faces along the probe's edge it goes on as it is before them: round the edge the tissue bends
+        up like a wall, on which a place across is no longer defined. A slab no wider than the probe keeps its
+        edges.
         """
         shift = self.shift + self.interface.slip(self.place + moved)
+        whole = [slice(None if half else 2, -2) for half in self.layout.symmetric]
         for axis in (0, 1):
-            found = np.moveaxis(shift, axis, 0)  # a view: lines across this axis first
-            along = found[..., 1 - axis]
-            for end, symmetric in ((-1, False), (0, self.layout.symmetric[axis])):
-                if symmetric:
+            found = np.moveaxis(shift, axis, 0)  # a view, across the edge first
+            for end, (edge, before) in ((-1, (slice(-2, None), -3)), (0, (slice(0, 2), 2))):
+                if end == 0 and self.layout.symmetric[axis]:
                     continue
-                edge, before = (slice(-2, None), -3) if end else (slice(0, 2), 2)
-                along[edge] = along[before]
+                more = found[edge, whole[1 - axis], axis] - found[before, whole[1 - axis], axis]
+                found[edge] = found[before]
+                found[edge, :, axis] += more.mean(axis=1, keepdims=True)
                 if not self.layout.res.side:
                     found[end, :, axis] = 0.0
         return shift
