@@ -96,6 +96,7 @@ def write(
     stiffness: float = STIFFNESS,
     first_step: float = 0.25,
     kind: str = "SURFACE TO SURFACE",
+    pair: str = "TIPFACE, SKINFACE",
 ) -> Path:
     """Write the deck of one press.
 
@@ -145,7 +146,7 @@ def write(
     if mechanics != "finite":
         _tie(out, model, used)
     else:
-        _contact(out, model, bricks, stiffness, kind)
+        _contact(out, model, bricks, stiffness, kind, pair)
     out.write("*BOUNDARY\nGLASS, 1, 3\nCHEST, 1, 2\n")
     for i, (_, axis) in enumerate(model.held):
         out.write(f"HELD{i}, {axis + 1}\n")
@@ -235,7 +236,7 @@ def _tie(out: StringIO, model: Model, used: NDArray[np.bool_]) -> None:
             out.write(f"*EQUATION\n2\n{tip + 1}, 3, 1., {under + 1}, 3, -1.\n")
 
 
-def _contact(out: StringIO, model: Model, bricks: Ints, stiffness: float, kind: str) -> None:
+def _contact(out: StringIO, model: Model, bricks: Ints, stiffness: float, kind: str, pair: str) -> None:
     """The probe's face is the dependent side, as only it has an edge that the other can slide past."""
     for name, nodes in (("TIPFACE", model.tip), ("SKINFACE", model.skin)):
         out.write(f"*SURFACE, NAME={name}, TYPE=ELEMENT\n")
@@ -243,4 +244,4 @@ def _contact(out: StringIO, model: Model, bricks: Ints, stiffness: float, kind: 
             out.write(f"{element}, S{face}\n")
     law = f"LINEAR\n{stiffness!r}\n" if np.isfinite(stiffness) else "HARD\n"
     out.write(f"*SURFACE INTERACTION, NAME=SMOOTH\n*SURFACE BEHAVIOR, PRESSURE-OVERCLOSURE={law}")
-    out.write(f"*CONTACT PAIR, INTERACTION=SMOOTH, TYPE={kind}\nSKINFACE, TIPFACE\n")
+    out.write(f"*CONTACT PAIR, INTERACTION=SMOOTH, TYPE={kind}\n{pair}\n")
