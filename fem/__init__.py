@@ -1,24 +1,54 @@
-"""Contact mechanics of probe and tissue: linear elasticity, three-dimensional, nearly incompressible.
+"""Contact mechanics of probe and tissue: nearly incompressible solids at finite or small strain, in contact.
 
-The nouns load at once; what computes is imported with the first `press`, so that reading a design stays fast.
+The nouns load at once; what computes is imported with its first use, so that reading a design stays fast.
 """
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from fem.model import Inclusion, Layer, NotModelled, Probe, Slab
+from fem.model import Inclusion, Layer, NotConverged, NotModelled, Pose, Probe, Slab
 from fem.scalars import scalars
 
 if TYPE_CHECKING:
-    from fem.pressing import Press, press
+    from fem.plane import Press2D, press_2d
+    from fem.plane_scalars import scalars_2d
+    from fem.pressing import Press, press, press_moduli
+    from fem.volume import save_volume, volume_grid
 
-__all__ = ["Inclusion", "Layer", "NotModelled", "Press", "Probe", "Slab", "press", "scalars"]
+__all__ = [
+    "Inclusion",
+    "Layer",
+    "NotConverged",
+    "NotModelled",
+    "Pose",
+    "Press",
+    "Press2D",
+    "Probe",
+    "Slab",
+    "press",
+    "press_2d",
+    "press_moduli",
+    "save_volume",
+    "scalars",
+    "scalars_2d",
+    "volume_grid",
+]
+
+_LATER = {
+    "Press": "pressing",
+    "press": "pressing",
+    "press_moduli": "pressing",
+    "Press2D": "plane",
+    "press_2d": "plane",
+    "scalars_2d": "plane_scalars",
+    "save_volume": "volume",
+    "volume_grid": "volume",
+}
 
 
 def __getattr__(name: str) -> Any:
-    if name in ("Press", "press"):
-        from fem import pressing
-
-        return getattr(pressing, name)
+    if name in _LATER:
+        return getattr(import_module(f"fem.{_LATER[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,34 +1,31 @@
-"""Stiffness of the 27-node hexahedron that does not lock: quadratic displacement, discontinuous linear
-pressure.
+"""Forces and tangent stiffness of the 27-node hexahedron: neo-Hookean, nearly incompressible, not locking.
 
-The volumetric stress is sought element by element among 1, x, y, z and condensed out, which leaves a
-symmetric positive definite stiffness in the displacements alone, at any Poisson's ratio below 1/2 (the stable
-Q2/P1 pair: Boffi, Brezzi and Fortin 2013, section 8.6; [boffi2013]).
+Stored energy per undeformed volume
+
+    W = mu/2 (J^(-2/3) tr C - 3) + kappa/2 (J - 1)²,    mu = E / 2(1 + nu), kappa = E / 3(1 - 2 nu),
+
+(Bonet and Wood 2008, section 6.5; [bonet2008]). The volumetric part is projected element by element onto
+1, x, y, z: a discontinuous linear pressure p, condensed out, which with quadratic displacements is stable up
+to incompressibility (Boffi, Brezzi and Fortin 2013, section 8.6; [boffi2013]) and leaves the displacements as
+the only unknowns. At zero displacement the tangent is the stiffness of linear elasticity.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
-from numpy.typing import NDArray
-from skfem import Basis, ElementHex2, MappingIsoparametric, MeshHex2
+from numpy.typing import DTypeLike, NDArray
+
+from fem.quadrature import DOFS, NODES, Quadrature
 
 Floats = NDArray[np.float64]
 
-NODES = 27
-DOFS = 81  # local dof = 3 * node + axis
-_CHUNK = 512  # elements at a time: keeps the temporaries in tens of megabytes
+_CHUNK = 128  # elements at a time: their temporaries stay in the cache
 
 
-def basis(mesh: MeshHex2, elements: NDArray[np.int64] | None = None) -> Basis:
-    """Scalar Q2 basis on curved elements with 27 quadrature points (the default would be 343)."""
-    element = ElementHex2()
-    return Basis(mesh, element, MappingIsoparametric(mesh, element), intorder=4, elements=elements)
-
-
-def element_dofs(mesh: MeshHex2) -> NDArray[np.int64]:
-    """Dofs 3 * node + axis of each element; shape (elements, 81)."""
-    nodes = mesh.dofs.element_dofs.T.astype(np.int64)
-    return np.asarray((3 * nodes[:, :, None] + np.arange(3)).reshape(len(nodes), DOFS))
+class Inverted(ArithmeticError):
+    """An element has turned inside out: the step was too long."""
 
 
 def lame(modulus: Floats, poisson: Floats) -> tuple[Floats, Floats]:
@@ -36,58 +33,152 @@ def lame(modulus: Floats, poisson: Floats) -> tuple[Floats, Floats]:
     return modulus / (2 * (1 + poisson)), modulus / (3 * (1 - 2 * poisson))
 
 
-def stiffness(
-    mesh: MeshHex2, modulus: Floats, poisson: Floats, elements: NDArray[np.int64] | None = None
-) -> Floats:
-    """Element stiffness matrices.
+def _chunks(elements: int) -> Iterator[slice]:
+    return (slice(start, min(start + _CHUNK, elements)) for start in range(0, elements, _CHUNK))
+
+
+def _deform(quad: Quadrature, part: slice, moved: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    """Gradients (n, 3, 27, q), deformation gradient F (n, q, 3, 3), its inverse and determinant."""
+    gradient = quad.gradient(part)
+    local = moved[quad.nodes[part]].transpose(0, 2, 1)  # (n, 3 components, 27)
+    # F[a, b] = delta + du_a / dX_b
+    slope = local[:, None] @ gradient  # (n, 3 b, 3 a, q)
+    f = slope.transpose(0, 3, 2, 1) + np.eye(3)
+    # the inverse by cofactors: many times faster than LAPACK on 3 x 3
+    inverse = np.empty_like(f)
+    for i in range(3):
+        for j in range(3):
+            a, b, c, d = (i + 1) % 3, (i + 2) % 3, (j + 1) % 3, (j + 2) % 3
+            inverse[..., j, i] = f[..., a, c] * f[..., b, d] - f[..., a, d] * f[..., b, c]
+    det = (f[..., 0, :] * inverse[..., :, 0]).sum(axis=-1)
+    if not det.min(initial=1.0) > 0:
+        raise Inverted
+    inverse /= det[..., None, None]
+    return gradient, f, inverse, det
+
+
+def slopes(quad: Quadrature, moved: Floats) -> Floats:
+    """Displacement gradients du_a / dX_b at the quadrature points, (m, q, 3, 3)."""
+    local = moved[quad.nodes].transpose(0, 2, 1)
+    return np.asarray((local[:, None] @ quad.gradient(slice(None))).transpose(0, 3, 2, 1))
+
+
+def _pressure(quad: Quadrature, part: slice, det: Floats, bulk: Floats) -> Floats:
+    """Projected volumetric stress p, tension positive, kPa; shape (n, q)."""
+    modes = quad.modes[part]
+    volume = (modes * (quad.weight[part] * (det - 1))[:, None]).sum(axis=2)
+    return bulk[:, None] * (volume[:, None] @ modes)[:, 0]
+
+
+def _deviator(f: Floats, det: Floats, shear: Floats) -> tuple[Floats, Floats]:
+    """Deviatoric Kirchhoff stress mu J^(-2/3) dev b (n, q, 3, 3) and mu J^(-2/3) tr b / 3 (n, q), kPa."""
+    scale = shear[:, None] * det ** (-2 / 3)
+    b = (f @ f.transpose(0, 1, 3, 2)) * scale[..., None, None]
+    mean = np.trace(b, axis1=2, axis2=3) / 3
+    b -= mean[..., None, None] * np.eye(3)
+    return b, mean
+
+
+def forces(quad: Quadrature, moved: Floats, shear: Floats, bulk: Floats) -> tuple[Floats, float]:
+    """Internal forces of each element, and the energy that all store.
 
     Parameters
     ----------
-    mesh
-        Curved hexahedra, mm.
-    modulus, poisson
-        Young's modulus (kPa) and Poisson's ratio of each of the elements asked for, shape (n,).
-    elements
-        Which elements, shape (n,); all of them by default.
+    moved
+        Displacement of the nodes, (nodes, 3) mm.
+    shear, bulk
+        Moduli of each element, (m,) kPa.
 
     Returns
     -------
-    (n, 81, 81) array, kPa mm = mN / mm, local dof = 3 * node + axis, symmetric, positive semidefinite.
+    (m, 27, 3) array, mN, the derivative of the energy, µJ.
+
+    Raises
+    ------
+    Inverted
+        Where a volume is not positive.
     """
-    chosen = np.arange(mesh.t.shape[1]) if elements is None else elements
-    shear, bulk = lame(modulus, poisson)
-    out = np.empty((len(chosen), DOFS, DOFS))
-    for start in range(0, len(chosen), _CHUNK):
-        part = slice(start, start + _CHUNK)
-        _stiffness(basis(mesh, chosen[part]), shear[part], bulk[part], out[part])
+    out, energy = np.empty((quad.size, NODES, 3)), 0.0
+    for part in _chunks(quad.size):
+        gradient, f, inverse, det = _deform(quad, part, moved)
+        stress, mean = _deviator(f, det, shear[part])
+        pressure = _pressure(quad, part, det, bulk[part])
+        # half p (J - 1) integrates to the projected energy, since p is in the space projected onto
+        stored = 1.5 * (mean - shear[part][:, None]) + 0.5 * pressure * (det - 1)
+        energy += float((quad.weight[part] * stored).sum())
+        stress += (pressure * det)[..., None, None] * np.eye(3)
+        # first Piola-Kirchhoff stress P = tau F^-T, weighted
+        piola = (stress @ inverse.transpose(0, 1, 3, 2)) * quad.weight[part][..., None, None]
+        n, q = det.shape
+        flat = gradient.transpose(0, 2, 1, 3).reshape(n, NODES, 3 * q)
+        out[part] = flat @ piola.transpose(0, 3, 1, 2).reshape(n, 3 * q, 3)
+    return out, energy
+
+
+def stiffness(
+    quad: Quadrature,
+    shear: Floats,
+    bulk: Floats,
+    moved: Floats | None = None,
+    elements: NDArray[np.int64] | None = None,
+    dtype: DTypeLike = np.float64,
+) -> NDArray[np.floating]:
+    """Tangent stiffness of each element, the derivative of `forces`.
+
+    Parameters
+    ----------
+    shear, bulk
+        Moduli of each of the elements asked for, (n,) kPa.
+    moved
+        Displacement of the nodes, (nodes, 3) mm; at rest by default.
+    elements
+        Which elements, (n,); all of them by default.
+    dtype
+        Of the result and of most of the work.
+
+    Returns
+    -------
+    (n, 81, 81) array, kPa mm = mN / mm, local dof = 3 * node + axis, symmetric.
+    """
+    if elements is not None:
+        quad = quad.part(elements)
+    out = np.empty((quad.size, DOFS, DOFS), dtype)
+    still = np.zeros((int(quad.nodes.max()) + 1, 3)) if moved is None else moved
+    for part in _chunks(quad.size):
+        _stiffness(quad, part, still, shear[part], bulk[part], out[part])
     return out
 
 
-def _stiffness(q2: Basis, shear: Floats, bulk: Floats, out: Floats) -> None:
-    n, points = q2.dx.shape
-    gradient = np.empty((n, NODES, 3, points))  # dN_i/dx_a
-    for i in range(NODES):
-        gradient[:, i] = q2.basis[i][0].grad.transpose(1, 0, 2)
-    flat = gradient.reshape(n, DOFS, points)
+def _stiffness(
+    quad: Quadrature, part: slice, moved: Floats, shear: Floats, bulk: Floats, out: NDArray[np.floating]
+) -> None:
+    gradient, f, inverse, det = _deform(quad, part, moved)
+    n, q = det.shape
+    weight = quad.weight[part]
+    stress, mean = _deviator(f, det, shear)
+    pressure = _pressure(quad, part, det, bulk) * det
+    kind = out.dtype
+    # spatial gradients g = F^-T grad N: (n, 27, 3, q), then flat as (n, 81, q), dof = 3 * node + axis
+    spatial = np.einsum("nqba,nbiq->niaq", inverse, gradient, optimize=True)
+    flat = spatial.reshape(n, DOFS, q).astype(kind)
 
-    # deviatoric part: 2 mu (e_ij e_ij - div^2 / 3), from the one Gram matrix of all derivatives
-    root = np.sqrt(q2.dx * shear[:, None])[:, None, :]
-    weighted = flat * root
-    gram = (weighted @ weighted.transpose(0, 2, 1)).reshape(n, NODES, 3, NODES, 3)
-    deviatoric = gram.transpose(0, 1, 4, 3, 2) - (2 / 3) * gram
-    trace = np.einsum("niaja->nij", gram)
+    # delta_ab g_i . b g_j equals delta_ab grad N_i . grad N_j: material and geometric part in one
+    root = np.sqrt(weight * shear[:, None] * det ** (-2 / 3))
+    plain = (gradient * root[:, None, None]).transpose(0, 2, 1, 3).reshape(n, NODES, 3 * q).astype(kind)
+    trace = plain @ plain.transpose(0, 2, 1)
+
+    # (mean - pJ) g_ib g_ja
+    crossed = (flat * (weight * (mean - pressure))[:, None].astype(kind)) @ flat.transpose(0, 2, 1)
+    k = crossed.reshape(n, NODES, 3, NODES, 3).transpose(0, 1, 4, 3, 2).reshape(n, DOFS, DOFS)
+    # h_ia g_jb + g_ia h_jb with h = (-2/3 tau_dev + (pJ - 2/3 mean)/2) g
+    tensor = (-2 / 3) * stress + (0.5 * (pressure - (2 / 3) * mean))[..., None, None] * np.eye(3)
+    h = np.einsum("nqab,nibq->niaq", tensor * weight[..., None, None], spatial, optimize=True)
+    mixed = h.reshape(n, DOFS, q).astype(kind) @ flat.transpose(0, 2, 1)
+    k = k + mixed + mixed.transpose(0, 2, 1)
+    # kappa B^T B with B the projected change of volume
+    coupling = (quad.modes[part] * (weight * det)[:, None]).astype(kind) @ flat.transpose(0, 2, 1)
+    coupling *= np.sqrt(bulk)[:, None, None].astype(kind)
+    k += coupling.transpose(0, 2, 1) @ coupling
     for a in range(3):
-        deviatoric[:, :, a, :, a] += trace
-
-    # volumetric part: bulk * B^T M^-1 B with B = int q_k div u, M = int q_k q_l, q = (1, x, y, z) about the
-    # middle
-    place = np.asarray(q2.global_coordinates())  # (3, n, points)
-    place = place - place.mean(axis=2, keepdims=True)
-    place = place / np.abs(place).max(axis=2, keepdims=True)
-    q = np.concatenate([np.ones((1, n, points)), place]).transpose(1, 0, 2)
-    weighted_q = q * q2.dx[:, None, :]
-    mass = weighted_q @ q.transpose(0, 2, 1)
-    # B is divided by M's Cholesky factor, so that the product is symmetric to the last bit
-    coupling = np.linalg.solve(np.linalg.cholesky(mass), weighted_q @ flat.transpose(0, 2, 1))
-    coupling *= np.sqrt(bulk)[:, None, None]
-    out[:] = deviatoric.reshape(n, DOFS, DOFS) + coupling.transpose(0, 2, 1) @ coupling
+        k[:, a::3, a::3] += trace
+    out[:] = 0.5 * (k + k.transpose(0, 2, 1))

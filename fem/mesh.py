@@ -1,43 +1,23 @@
-"""Hexahedra that fit the sphere: topology fixed per resolution, coordinates that morph with the geometry.
+"""From logical to real coordinates: hexahedra that morph smoothly with the geometry.
 
-The slab is a tensor grid in which a box around the inclusion is replaced by an O-grid (a cubed sphere: a
-small central cube, shells out to the sphere, shells on to the box). All of it lives first in *logical*
-coordinates, where each shell is a concentric cube, and `morph` carries logical to real ones. Sizes, depths
-and widths only enter `morph`, so every inclusion shares one topology, and answers vary smoothly with the
-geometry.
-
-Only the quarter x >= 0, y >= 0 is meshed; logical x and y may be mirrored to get the other quarters.
+Sizes, depths, offsets and widths only enter here, so every inclusion shares one topology (`fem.topology`),
+and answers vary smoothly with the geometry. Under the contact surface the grid lines follow the inclusion; on
+the surface they stay within the probe's edges, and the layers between shear from one to the other.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from skfem import ElementHex2, MeshHex, MeshHex2
+from scipy.interpolate import RegularGridInterpolator
+from skfem import ElementHex2, MeshHex2
 
-from fem.model import Inclusion, Probe, Slab
+from fem.model import STRAIGHT, Inclusion, NotModelled, Pose, Probe, Slab
+from fem.topology import Layout, Resolution, probe_topology, slab_topology
 
 Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class Resolution:
-    """Cells along each part of the mesh."""
-
-    arc: int  # along 45 degrees of the sphere = along half an edge of the box
-    core: int  # shells between the central cube and the sphere
-    shell: int  # shells between the sphere and the box
-    above: int  # layers between the contact surface and the box
-    below: int  # layers between the box and the chest wall
-    edge: int  # between the box and the probe's edge, graded towards the edge
-    side: int  # between the probe's edge and the slab's side, graded towards the edge
-    layer: int  # through the probe's contact layer
-    backing: int  # through each of its other layers
-
 
 # Largest error of tared maximum and total against 145 thousand unknowns, for (size, depth, modulus) =
 # (10, 5, 100), (4, 6, 60), (13, 4, 120): preview 2 %, standard 0.5 %, reference 0.2 %. Shells outside the
@@ -50,37 +30,132 @@ QUALITIES = {
 
 
 @dataclass(frozen=True)
-class Box:
-    """The O-grid in real coordinates, mm: sphere radius and centre depth, box half side, top and bottom."""
+class Geometry:
+    """One specimen under one probe."""
 
-    radius: float
-    centre: float
-    half: float
+    probe: Probe
+    slab: Slab
+    inclusion: Inclusion | None = None
+    pose: Pose = STRAIGHT
+
+    def layout(self, res: Resolution) -> Layout:
+        """The topology that the symmetry of this geometry allows; no cells beside a probe as wide as the
+        slab."""
+        if self.probe.width_mm == self.slab.width_mm:
+            res = Resolution(**{**res.__dict__, "side": 0})
+        offset = (0.0, 0.0) if self.inclusion is None else self.inclusion.offset
+        turned = self.pose.tilt_deg[::-1]  # a turn about y breaks the symmetry in x
+        broken = [any((o, p, t)) for o, p, t in zip(offset, self.pose.position_mm, turned, strict=True)]
+        return Layout(res, len(self.probe.layers), (not broken[0], not broken[1]))
+
+
+@dataclass(frozen=True)
+class Span:
+    """Grid lines along one axis, mm: of the box, of the probe's edge and of the slab's side, at each end."""
+
+    middle: float
+    low: float
+    high: float
+    edge_low: float
+    edge_high: float
+    side_low: float
+    side_high: float
+
+    def lines(self, logical: Floats, res: Resolution) -> Floats:
+        """Real coordinate of logical ones: even in the box, finer towards the probe's edge from both
+        sides."""
+        knots = np.concatenate([[0.0], res.reach + np.arange(res.edge + res.side + 1.0)])
+
+        def half(box: float, edge: float, side: float) -> Floats:
+            inner = edge - (edge - box) * graded(res.edge, 1.7)[::-1]
+            outer = edge + (side - edge) * graded(res.side, 2.2) if res.side else np.array([edge])
+            return np.concatenate([[self.middle], inner, outer[1:]])
+
+        above = np.interp(logical, knots, half(self.high, self.edge_high, self.side_high))
+        below = np.interp(-logical, knots, half(self.low, self.edge_low, self.side_low))
+        return np.where(logical < 0, below, above)
+
+
+@dataclass(frozen=True)
+class Box:
+    """The O-grid in real coordinates, mm: inclusion's centre and radii; top and bottom; lines of x and y at
+    the inclusion and on the contact surface."""
+
+    centre: tuple[float, float, float]
+    radii: tuple[float, float, float]
     top: float
     bottom: float
+    deep: tuple[Span, Span]
+    surface: tuple[Span, Span]
 
 
-def box_around(inclusion: Inclusion | None, probe: Probe, slab: Slab) -> Box:
-    """Place the box; every gap is a smooth function of the geometry and stays in slab and footprint."""
-    half_probe = probe.width_mm / 2
+def _smooth_min(*values: float) -> float:
+    return float(sum(v**-4 for v in values) ** -0.25)
+
+
+def _softplus(value: float, width: float) -> float:
+    """Smooth max(value, 0)."""
+    return 0.5 * (value + float(np.hypot(value, width)))
+
+
+def box_around(geometry: Geometry) -> Box:
+    """Place the box; every gap is a smooth function of the geometry and stays in the slab."""
+    probe, slab, inclusion, pose = geometry.probe, geometry.slab, geometry.inclusion, geometry.pose
+    half = probe.width_mm / 2
     if inclusion is None:  # any sphere will do: its moduli will be the tissue's
-        radius = min(0.15 * slab.thickness_mm, 0.3 * half_probe)
-        centre = 0.4 * slab.thickness_mm
+        radius = min(0.15 * slab.thickness_mm, 0.3 * half)
+        radii, centre = (radius,) * 3, (0.0, 0.0, 0.4 * slab.thickness_mm)
     else:
-        radius, centre = inclusion.size / 2, inclusion.centre_mm
-    wish = 1.5 + 0.8 * radius
+        radii, centre = inclusion.radii_mm, (*inclusion.offset, inclusion.centre_mm)
 
-    def gap(room: float) -> float:
+    def gap(radius: float, room: float) -> float:
         # a smooth minimum of the wish and 60 % of the room
-        return float((wish**-4 + (0.6 * room) ** -4) ** -0.25)
+        return _smooth_min(1.5 + 0.8 * radius, 0.6 * room)
 
+    spans = [_span(centre[k], radii[k], half, slab.width_mm / 2, pose.position_mm[k]) for k in (0, 1)]
+    above, below = centre[2] - radii[2], slab.thickness_mm - centre[2] - radii[2]
     return Box(
-        radius,
-        centre,
-        half=radius + gap(half_probe - radius),
-        top=centre - radius - gap(centre - radius),
-        bottom=centre + radius + gap(slab.thickness_mm - centre - radius),
+        centre=centre,
+        radii=radii,
+        top=above - gap(radii[2], above),
+        bottom=centre[2] + radii[2] + gap(radii[2], below),
+        deep=(spans[0][0], spans[1][0]),
+        surface=(spans[0][1], spans[1][1]),
     )
+
+
+def _span(centre: float, radius: float, half: float, side: float, position: float) -> tuple[Span, Span]:
+    """Lines along one axis at the inclusion and on the contact surface.
+
+    centre, radius: of the inclusion; half: of the probe; side: half the slab; position: probe minus slab
+    centre; all mm.
+    """
+    wish = 1.5 + 0.8 * radius
+    margin = 0.12 * half
+
+    def deep(sign: int) -> tuple[float, float, float]:
+        """Outward coordinate of box, probe's edge and slab's side."""
+        wall = side - sign * position
+        rim = sign * centre + radius
+        if side == half:
+            return rim + _smooth_min(wish, 0.6 * (wall - rim)), half, wall
+        gap = _smooth_min(wish, 0.6 * _softplus(half - rim, 0.1 * half))
+        gap = _smooth_min((gap**4 + (0.3 * wish) ** 4) ** 0.25, 0.6 * (wall - rim))
+        box = rim + gap
+        room = _smooth_min(0.5 * margin, 0.3 * (wall - box))
+        return box, half + _softplus(box + room - half, 0.25 * room), wall
+
+    def within(line: float, inset_low: float, inset_high: float) -> float:
+        """Pull a line smoothly inside of the probe's edges."""
+        over = _softplus(line - (half - inset_high), 0.3 * margin)
+        return line - over + _softplus(-(half - inset_low) - line, 0.3 * margin)
+
+    high, edge_high, side_high = deep(1)
+    low, edge_low, side_low = (-value for value in deep(-1))
+    at_depth = Span(centre, low, high, edge_low, edge_high, side_low, side_high)
+    low_s, high_s = within(low, margin, 3 * margin), within(high, 3 * margin, margin)
+    middle = low_s + (high_s - low_s) * (centre - low) / (high - low)
+    return at_depth, Span(middle, low_s, high_s, -half, half, side_low, side_high)
 
 
 def graded(cells: int, ratio: float) -> Floats:
@@ -100,143 +175,119 @@ def round_cube(q: Floats) -> Floats:
     )
 
 
-# --- topology, in logical coordinates ---------------------------------------------------------------------
+def rotation(tilt_deg: tuple[float, float]) -> Floats:
+    """Rotation matrix (3, 3) about x, then y, by angles in degrees."""
+    (cx, cy), (sx, sy) = np.cos(np.radians(tilt_deg)), np.sin(np.radians(tilt_deg))
+    about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+    about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+    return np.asarray(about_y @ about_x)
 
 
-def _grid(x: Floats, y: Floats, z: Floats) -> tuple[Floats, Ints]:
-    """Tensor grid: points (3, n) and hexahedra (8, m) in scikit-fem's order of corners."""
-    mesh = MeshHex.init_tensor(x, y, z)
-    return mesh.p, mesh.t.astype(np.int64)
+def morph_slab(layout: Layout, geometry: Geometry, shift: Floats | None = None) -> MeshHex2:
+    """The slab's mesh in real coordinates (mm), its curved elements following the inclusion.
 
+    The frame is the probe's: where the probe is tilted, the slab lies turned the other way.
 
-def _merge(parts: list[tuple[Floats, Ints]]) -> MeshHex:
-    """Join grids at coincident logical points."""
-    points = np.hstack([p for p, _ in parts])
-    shift = np.cumsum([0] + [p.shape[1] for p, _ in parts])
-    cells = np.hstack([t + s for (_, t), s in zip(parts, shift, strict=False)])
-    _, first, inverse = np.unique(np.round(points, 9), axis=1, return_index=True, return_inverse=True)
-    cells = inverse.reshape(-1)[cells]
-    a, b, c, d = (points[:, first][:, cells[i]] for i in (0, 3, 2, 1))  # corner and its x, y, z neighbours
-    volume = np.einsum("ik,ik->k", b - a, np.cross(c - a, d - a, axis=0))
-    flipped = volume < 0  # mirror the left-handed ones in their own first axis
-    cells[:, flipped] = cells[[3, 5, 6, 0, 7, 1, 2, 4]][:, flipped]
-    return MeshHex(np.ascontiguousarray(points[:, first]), np.ascontiguousarray(cells))
-
-
-@lru_cache(maxsize=8)
-def slab_topology(res: Resolution) -> MeshHex2:
-    """Slab in logical coordinates; the inclusion is the cube |x|, |y|, |z| <= arc + core about the origin."""
-    n, reach = res.arc, res.arc + res.core + res.shell
-    face = reach * np.arange(n + 1) / n
-    lateral = np.concatenate([face, reach + 1.0 + np.arange(res.edge + res.side)])
-    half = face[1:]
-    vertical = np.concatenate(
-        [-reach - np.arange(res.above, 0, -1.0), -half[::-1], face, reach + 1.0 + np.arange(res.below)]
-    )
-    points, cells = _grid(lateral, lateral, vertical)
-    middle = points[:, cells].mean(axis=1)
-    outside = np.abs(middle).max(axis=0) > reach
-    used, cells = np.unique(cells[:, outside], return_inverse=True)
-    parts = [(points[:, used], cells.reshape(8, -1))]
-    quarter, whole = np.arange(n + 1.0), np.arange(-n, n + 1.0)
-    parts.append(_grid(quarter, quarter, whole))
-    radial = np.arange(n, reach + 1.0)
-    for axis, sign, u, v in (
-        (0, 1, quarter, whole),
-        (1, 1, quarter, whole),
-        (2, 1, quarter, quarter),
-        (2, -1, quarter, quarter),
-    ):
-        p, t = _grid(radial, u / n, v / n)
-        s, pu, pv = p
-        q = np.empty_like(p)
-        others = [i for i in range(3) if i != axis]
-        q[axis], q[others[0]], q[others[1]] = sign * s, s * pu, s * pv
-        parts.append((q, t))
-    return MeshHex2.from_mesh(_merge(parts))
-
-
-@lru_cache(maxsize=8)
-def probe_topology(res: Resolution, layers: int) -> MeshHex2:
-    """Probe in logical coordinates: the slab's footprint lines, and z from -(layers) at the glass to 0."""
-    n, reach = res.arc, res.arc + res.core + res.shell
-    lateral = np.concatenate([reach * np.arange(n + 1) / n, reach + 1.0 + np.arange(res.edge)])
-    counts = [res.layer] + [res.backing] * (layers - 1)
-    vertical = np.unique(np.concatenate([-i - np.arange(c + 1) / c for i, c in enumerate(counts)]))
-    return MeshHex2.from_mesh(_merge([_grid(lateral, lateral, vertical)]))
-
-
-# --- from logical to real coordinates ---------------------------------------------------------------------
-
-
-def _lateral(logical: Floats, res: Resolution, box: Box, probe: Probe, slab: Slab) -> Floats:
-    """x (or y) of grid lines: even in the box, shrinking to the probe's edge, then growing to the side."""
-    reach, w, s = res.arc + res.core + res.shell, probe.width_mm / 2, slab.width_mm / 2
-    inner = w - (w - box.half) * graded(res.edge, 1.7)[::-1]
-    outer = w + (s - w) * graded(res.side, 2.2)
-    real = np.concatenate([[0.0], inner, outer[1:]])
-    knots = np.concatenate([[0.0], reach + np.arange(res.edge + res.side + 1.0)])
-    return np.asarray(np.interp(logical, knots, real))
-
-
-def morph_slab(res: Resolution, box: Box, probe: Probe, slab: Slab) -> MeshHex2:
-    """The slab's mesh in real coordinates (mm), its curved elements following the sphere.
+    Parameters
+    ----------
+    shift
+        By how much to move the nodes under the probe's within the slab's surface, (nx, ny, 2) mm. Between the
+        surface and the box, and between the probe's edge and the slab's side, it fades out.
 
     Raises
     ------
-    ValueError
+    NotModelled
         If an element turns inside out.
     """
-    logical = slab_topology(res)
+    res, box = layout.res, box_around(geometry)
+    logical = slab_topology(layout)
     p = logical.doflocs
-    reach = res.arc + res.core + res.shell
     knots = np.concatenate(
-        [-reach - np.arange(res.above, 0, -1.0), [-reach, 0, reach], reach + 1.0 + np.arange(res.below)]
+        [
+            -res.reach - np.arange(res.above, 0, -1.0),
+            [-res.reach, 0, res.reach],
+            res.reach + 1.0 + np.arange(res.below),
+        ]
     )
+    below = (geometry.slab.thickness_mm - box.bottom) * graded(res.below, 1.3)[1:]
     heights = np.concatenate(
-        [
-            box.top * np.arange(res.above) / res.above,
-            [box.top, box.centre, box.bottom],
-            box.bottom + (slab.thickness_mm - box.bottom) * graded(res.below, 1.3)[1:],
-        ]
+        [box.top * np.arange(res.above) / res.above, [box.top, box.centre[2], box.bottom], box.bottom + below]
     )
+    blend = np.clip((p[2] + res.reach + res.above) / res.above, 0, 1)
     real = np.stack(
-        [*(_lateral(p[i], res, box, probe, slab) for i in (0, 1)), np.interp(p[2], knots, heights)]
-    )
-
-    inside = np.abs(p).max(axis=0) < reach - 1e-9
-    q = p[:, inside]
-    level = np.abs(q).max(axis=0)
-    q = q / np.maximum(level, res.arc)
-    ball = round_cube(q)
-    cube = 0.55 * box.radius * (0.5 * q + 0.5 * ball)
-    sphere = box.radius * ball
-    wall = np.stack(
         [
-            box.half * q[0],
-            box.half * q[1],
-            np.where(q[2] < 0, box.centre - box.top, box.bottom - box.centre) * q[2],
+            *(
+                (1 - blend) * box.surface[k].lines(p[k], res) + blend * box.deep[k].lines(p[k], res)
+                for k in (0, 1)
+            ),
+            np.interp(p[2], knots, heights),
         ]
     )
-    rim = res.arc + res.core
+    if shift is not None and res.side:
+        real[:2] += (1 - blend) * _extended(layout, shift, p)
+    inside = np.abs(p).max(axis=0) < res.reach - 1e-9
+    real[:, inside] = _o_grid(p[:, inside], res, box)
+    mesh = MeshHex2(rotation(geometry.pose.tilt_deg).T @ real, logical.t)
+    return _checked(mesh, "slab")
+
+
+def _extended(layout: Layout, shift: Floats, logical: Floats) -> Floats:
+    """Field (nx, ny, 2) of the footprint's nodes at logical places (3, n), falling to 0 at the slab's side;
+    (2, n)."""
+    res = layout.res
+    side = res.reach + res.edge + res.side
+    lines = []
+    padding = []
+    for symmetric in layout.symmetric:
+        half = np.concatenate(
+            [
+                res.reach * np.arange(2 * res.arc + 1) / (2 * res.arc),
+                res.reach + np.arange(1, 2 * res.edge + 1) / 2,
+            ]
+        )
+        # a symmetry plane is no side: the field goes on beyond it
+        lines.append(np.concatenate([half if symmetric else _mirrored(half), [side]]))
+        if not symmetric:
+            lines[-1] = np.concatenate([[-side], lines[-1]])
+        padding.append((0 if symmetric else 1, 1))
+    padded = np.pad(shift, (*padding, (0, 0)))
+    return np.asarray(RegularGridInterpolator(lines, padded)(logical[:2].T).T)
+
+
+def _mirrored(half: Floats) -> Floats:
+    return np.concatenate([-half[:0:-1], half])
+
+
+def _o_grid(logical: Floats, res: Resolution, box: Box) -> Floats:
+    """Real coordinates (3, n) of logical ones within the box."""
+    level = np.abs(logical).max(axis=0)
+    q = logical / np.maximum(level, res.arc)
+    ball = round_cube(q)
+    radii = np.reshape(box.radii, (3, 1))
+    cube = 0.55 * radii * (0.5 * q + 0.5 * ball)
+    inclusion = radii * ball
+    ends = [(span.low - span.middle, span.high - span.middle) for span in box.deep]
+    ends.append((box.top - box.centre[2], box.bottom - box.centre[2]))
+    wall = np.stack([np.where(q[k] < 0, -low, high) * q[k] for k, (low, high) in enumerate(ends)])
     core = np.clip((level - res.arc) / res.core, 0, 1)
-    shell = np.interp(level, rim + np.arange(res.shell + 1.0), graded(res.shell, 1.4))
-    local = np.where(
-        level <= rim + 1e-9, (1 - core) * cube + core * sphere, (1 - shell) * sphere + shell * wall
-    )
-    local[2] += box.centre
-    real[:, inside] = local
-    return _checked(MeshHex2(real, logical.t), "slab")
+    shell = np.interp(level, res.rim + np.arange(res.shell + 1.0), graded(res.shell, 1.4))
+    within = (1 - core) * cube + core * inclusion
+    without = (1 - shell) * inclusion + shell * wall
+    return np.where(level <= res.rim + 1e-9, within, without) + np.reshape(box.centre, (3, 1))
 
 
-def morph_probe(res: Resolution, box: Box, probe: Probe, slab: Slab) -> MeshHex2:
-    """The probe's mesh in real coordinates (mm), z from -thickness at the glass to 0 in contact."""
-    logical = probe_topology(res, len(probe.layers))
+def morph_probe(layout: Layout, geometry: Geometry) -> MeshHex2:
+    """The probe's mesh in real coordinates (mm), from z = -thickness at the glass to the contact surface,
+    whose middle is the origin; the contact layer takes up the dome."""
+    logical, probe, box = probe_topology(layout), geometry.probe, box_around(geometry)
     p = logical.doflocs
     depths = -np.cumsum([0.0] + [layer.thickness_mm for layer in probe.layers])
     z = np.interp(p[2], -np.arange(len(depths))[::-1], depths[::-1])
-    lateral = [_lateral(p[i], res, box, probe, slab) for i in (0, 1)]
-    return _checked(MeshHex2(np.stack([*lateral, z]), logical.t), "probe")
+    x, y = (box.surface[k].lines(p[k], layout.res) for k in (0, 1))
+    if probe.dome_radius_mm is not None:
+        sag = probe.dome_radius_mm - np.sqrt(probe.dome_radius_mm**2 - x**2 - y**2)
+        z = z - sag * np.clip(1 + p[2], 0, 1)
+    return _checked(MeshHex2(np.stack([x, y, z]), logical.t), "probe")
 
 
 def _checked(mesh: MeshHex2, name: str) -> MeshHex2:
@@ -246,21 +297,8 @@ def _checked(mesh: MeshHex2, name: str) -> MeshHex2:
     if det.min() <= 0:
         cell = int(det.min(axis=1).argmin())
         x, y, z = mesh.p[:, mesh.t[:, cell]].mean(axis=1)
-        raise ValueError(
+        raise NotModelled(
             f"mesh: received a geometry that turns an element of the {name} inside out "
             f"near ({x:.2f}, {y:.2f}, {z:.2f}) mm; allowed are inclusions with more room around them"
         )
     return mesh
-
-
-def slab_materials(res: Resolution) -> Ints:
-    """Material of each slab element: 1 inside the sphere, else 0; shape (elements,)."""
-    logical = slab_topology(res)
-    level = np.abs(logical.p[:, logical.t].mean(axis=1)).max(axis=0)
-    return np.asarray(level < res.arc + res.core, dtype=np.int64)
-
-
-def probe_materials(res: Resolution, layers: int) -> Ints:
-    """Material of each probe element: 2 for the contact layer, 3 for the next, ...; shape (elements,)."""
-    logical = probe_topology(res, layers)
-    return np.asarray(2 + np.floor(-logical.p[2, logical.t].mean(axis=0)), dtype=np.int64)

@@ -1,24 +1,31 @@
-"""Press the probe on the slab: linear elasticity, frictionless contact that must stay closed."""
+"""Press the probe on the slab: the verb of this package."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal, overload
 
 import numpy as np
 import pyvista as pv
 from numpy.typing import NDArray
 
-from fem import mesh, surface
-from fem.model import Inclusion, NotModelled, Probe, Slab, check
+from fem import mesh, surface, volume
+from fem.equilibrium import NotConverged as Stuck
+from fem.equilibrium import State
+from fem.mesh import Geometry
+from fem.model import Inclusion, NotConverged, NotModelled, Pose, Probe, Slab, check
+from fem.path import build, moduli, path
 from fem.solver import one_thread
-from fem.system import Solution, Unit, solve
+from fem.topology import Resolution, materials, probe_topology, slab_topology
+from fem.trust import discretisation_error
 
 Floats = NDArray[np.float64]
 Progress = Callable[[str, float], None]
+Mechanics = Literal["finite", "linear"]
 
-_memory: dict[tuple[object, ...], Solution] = {}  # the last solution: further press levels only scale it
+MECHANICS = ("finite", "linear")
 _TOO_UNEVEN = (
     "press: received moduli or lengths so far apart that the equations cannot be solved; "
     "not modelled: allowed are moduli and lengths closer to each other"
@@ -34,24 +41,30 @@ class Press:
     surface
         The whole contact surface: undeformed points (n, 3) mm, quads on all Q2 nodes, and of each point
         `displacement` (n, 3) mm of the probe, in its frame, +z into the specimen, so that pushed in is
-        negative; `pressure` (n,) kPa, compression positive (see `fem.surface.pressure`); `displacement_0`,
-        `pressure_0`; and the lumped `area` (n,) mm²: `pressure * area` sums to the force.
+        negative; `pressure` (n,) kPa, compression positive, on the deformed surface; `displacement_0`,
+        `pressure_0`; and the lumped areas `area`, `area_0` (n,) mm² of the deformed surface seen along z:
+        `pressure * area` sums to the force. Points are a grid, x-major.
     cut
-        The plane y = 0 of probe and slab: `displacement`, `displacement_0` (n, 3) mm, in the probe's frame,
-        so that the chest wall moves by -indentation; cells' `material`: 0 tissue, 1 inclusion, 2, 3, ...
-        layers from the contact side.
+        The cut through the middle of probe and inclusion along x: `displacement`, `displacement_0` (n, 3) mm,
+        in the probe's frame, so that the chest wall moves by -indentation; cells' `material`: 0 tissue, 1
+        inclusion, 2, 3, ... layers from the contact side.
     indentation_mm, indentation_0_mm
-        Travel of the glass against the chest wall; they differ when pressed by force.
+        Travel of the glass towards the chest wall since the middle of the contact surface met the slab's
+        undeformed surface; they differ when pressed by force.
     force_N, force_0_N, chest_force_N
-        Force on the contact surface, the same without inclusion, and the chest wall's reaction; compression
-        positive.
+        Force on the contact surface along z, the same without inclusion, and the chest wall's reaction;
+        compression positive.
     min_pressure_kPa
-        The smallest contact pressure of the two states; always positive, or the press would have been
-        refused.
+        The smallest contact pressure of the two states; 0 where contact has opened.
     dof, seconds
-        Unknowns and time taken.
+        Unknowns, and the time that the call had taken when this level was done.
     path
-        How contact was treated: "tied".
+        How contact was treated: "tied" (linear, closed all over), "sliding" (finite strain, closed all over)
+        or "unilateral" (some of it is open).
+    mechanics
+        "finite" strain or "linear" elasticity.
+    error_percent
+        Estimate of the discretisation error of the tared displacement, in per cent of its maximum.
     """
 
     surface: pv.PolyData
@@ -64,9 +77,67 @@ class Press:
     min_pressure_kPa: float
     dof: int
     seconds: float
-    path: str = "tied"
+    path: str
+    mechanics: str
+    error_percent: float
+    _states: tuple[State, State] = field(repr=False)
+    _geometry: Geometry = field(repr=False)
+
+    def volume(self) -> pv.UnstructuredGrid:
+        """Displacement, material, modulus and stress throughout probe and slab; see `fem.volume`."""
+        state, bare = self._states
+        model = state.model
+        of = materials(model.layout)
+        gradient, weight, where = volume.gradients(model.place, model.nodes.cells, state.moved)
+        shear, bulk = moduli(self._geometry, model, True)
+        finite = self.mechanics == "finite"
+        dilation = (
+            np.linalg.det(np.eye(3) + gradient) - 1 if finite else np.trace(gradient, axis1=-2, axis2=-1)
+        )
+        stress = volume.cell_stress(
+            gradient, volume.linear_pressure(dilation, bulk, weight, where), shear, weight, self.mechanics
+        )
+        return volume.volume_grid(
+            model.place,
+            model.nodes.cells,
+            state.moved,
+            bare.moved,
+            of,
+            9 * bulk * shear / (3 * bulk + shear),
+            stress,
+            mirror=tuple(a for a, half in zip("xy", model.layout.symmetric, strict=True) if half),
+        )
 
 
+@overload
+def press(
+    probe: Probe,
+    slab: Slab,
+    inclusion: Inclusion | None,
+    indentation: Sequence[float],
+    *,
+    mechanics: Mechanics = ...,
+    quality: str = ...,
+    tilt: tuple[float, float] = ...,
+    position: tuple[float, float] = ...,
+    estimate: bool = ...,
+    progress: Progress | None = ...,
+) -> list[Press]: ...
+@overload
+def press(
+    probe: Probe,
+    slab: Slab,
+    inclusion: Inclusion | None,
+    *,
+    force: Sequence[float],
+    mechanics: Mechanics = ...,
+    quality: str = ...,
+    tilt: tuple[float, float] = ...,
+    position: tuple[float, float] = ...,
+    estimate: bool = ...,
+    progress: Progress | None = ...,
+) -> list[Press]: ...
+@overload
 def press(
     probe: Probe,
     slab: Slab,
@@ -74,10 +145,28 @@ def press(
     indentation: float | None = None,
     *,
     force: float | None = None,
+    mechanics: Mechanics = ...,
+    quality: str = ...,
+    tilt: tuple[float, float] = ...,
+    position: tuple[float, float] = ...,
+    estimate: bool = ...,
+    progress: Progress | None = ...,
+) -> Press: ...
+def press(
+    probe: Probe,
+    slab: Slab,
+    inclusion: Inclusion | None,
+    indentation: float | Sequence[float] | None = None,
+    *,
+    force: float | Sequence[float] | None = None,
+    mechanics: Mechanics = "finite",
     quality: str = "standard",
+    tilt: tuple[float, float] = (0.0, 0.0),
+    position: tuple[float, float] = (0.0, 0.0),
+    estimate: bool = True,
     progress: Progress | None = None,
-) -> Press:
-    """Press the probe straight down on the slab, above the inclusion.
+) -> Press | list[Press]:
+    """Press the probe on the slab; one level, or a list of levels for a sequence, found on one way down.
 
     Parameters
     ----------
@@ -86,9 +175,18 @@ def press(
     indentation
         Travel of the glass towards the chest wall, mm; give this or `force`.
     force
-        Force between probe and slab, N; the state without inclusion then has the same force.
+        Force between probe and slab along the probe's axis, N; the state without inclusion then has the same
+        force.
+    mechanics
+        "finite": neo-Hookean solids and sliding contact. "linear": small strain, as the source paper has it.
     quality
         "preview", "standard" or "reference".
+    tilt
+        Rotation of the probe about x, then y, through the middle of its contact surface, degrees.
+    position
+        The probe's centre minus the slab's, mm. `inclusion.offset` stays relative to the probe.
+    estimate
+        False leaves out the estimate of the discretisation error (NaN), which takes a coarser solution.
     progress
         Called as progress(stage, fraction done).
 
@@ -97,100 +195,197 @@ def press(
     ValueError
         On impossible input, in one line.
     NotModelled
-        On possible input that is not modelled: off-centre inclusion, overhanging probe, contact that opens.
+        On possible input that is not modelled.
+    NotConverged
+        If no equilibrium is found, in one line.
 
     Example
     -------
     >>> layers = (Layer(2, 27), Layer(3, 61), Layer(5, 156))
     >>> press(Probe(25, layers), Slab(30, 60, 5), Inclusion(10, 5, 100), 2.0).force_N  # doctest: +SKIP
     """
-    start = time.perf_counter()
+    levels, by_force, several = _levels(indentation, force)
+    _known("quality", quality, mesh.QUALITIES)
+    _known("mechanics", mechanics, MECHANICS)
+    geometry = _geometry(probe, slab, inclusion, tilt, position)
+    answers = _presses([geometry], levels, by_force, mechanics, mesh.QUALITIES[quality], estimate, progress)
+    (found,) = answers
+    return found if several else found[0]
+
+
+def press_moduli(
+    probe: Probe,
+    slab: Slab,
+    inclusion: Inclusion,
+    moduli: Sequence[float],
+    indentation: float | Sequence[float],
+    *,
+    mechanics: Mechanics = "finite",
+    quality: str = "standard",
+    tilt: tuple[float, float] = (0.0, 0.0),
+    position: tuple[float, float] = (0.0, 0.0),
+    estimate: bool = True,
+    progress: Progress | None = None,
+) -> list[list[Press]]:
+    """Press on inclusions that differ in their modulus only, which share mesh, factor and background.
+
+    Returns
+    -------
+    For each modulus (kPa) the list of levels; else as `press`, with `inclusion.modulus` left out of account.
+    """
+    levels, _, _ = _levels(indentation, None)
+    _known("quality", quality, mesh.QUALITIES)
+    _known("mechanics", mechanics, MECHANICS)
+    several = [_geometry(probe, slab, replace(inclusion, modulus=float(m)), tilt, position) for m in moduli]
+    return list(_presses(several, levels, False, mechanics, mesh.QUALITIES[quality], estimate, progress))
+
+
+def _known(name: str, value: str, allowed: object) -> None:
+    if value not in allowed:  # type: ignore[operator]
+        raise ValueError(f"{name}: received {value!r}; allowed {', '.join(allowed)}")  # type: ignore[arg-type]
+
+
+def _geometry(
+    probe: Probe,
+    slab: Slab,
+    inclusion: Inclusion | None,
+    tilt: tuple[float, float],
+    position: tuple[float, float],
+) -> Geometry:
+    pose = Pose(tuple(tilt), tuple(position))  # type: ignore[arg-type]
+    check(probe, slab, inclusion, pose)
+    return Geometry(probe, slab, inclusion, pose)
+
+
+def _levels(
+    indentation: float | Sequence[float] | None, force: float | Sequence[float] | None
+) -> tuple[list[float], bool, bool]:
+    """Levels, whether they are forces, and whether a list is wanted."""
     if (indentation is None) == (force is None):
         raise ValueError(
             f"indentation, force: received {indentation} and {force}; allowed exactly one of the two"
         )
-    name, amount = ("indentation", indentation) if force is None else ("force", force)
-    assert amount is not None
-    if not (np.isfinite(amount) and amount > 0):
-        raise ValueError(f"{name}: received {amount}; allowed are positive finite numbers")
-    if quality not in mesh.QUALITIES:
-        raise ValueError(f"quality: received {quality!r}; allowed {', '.join(mesh.QUALITIES)}")
-    check(probe, slab, inclusion)
-    res = mesh.QUALITIES[quality]
-    if probe.width_mm == slab.width_mm:
-        res = replace(res, side=0)
+    name, given = ("indentation", indentation) if force is None else ("force", force)
+    several = np.ndim(given) > 0  # type: ignore[arg-type]
+    levels = [float(level) for level in (given if several else [given])]  # type: ignore[union-attr, arg-type]
+    for level in levels:
+        if not (np.isfinite(level) and level > 0):
+            raise ValueError(f"{name}: received {level}; allowed are positive finite numbers")
+    if not levels:
+        raise ValueError(f"{name}: received no level; allowed at least one")
+    return levels, force is not None, several
 
-    key = (probe, slab, inclusion, quality)
-    if key not in _memory:
-        try:
-            with one_thread():
-                found = solve(probe, slab, inclusion, res, progress or (lambda stage, fraction: None))
-        except np.linalg.LinAlgError:
-            raise NotModelled(_TOO_UNEVEN) from None
-        _memory.clear()
-        _memory[key] = found
-    solution = _memory[key]
 
-    units = solution.with_inclusion, solution.without
-    if force is None:
-        scales = amount, amount
-    else:
-        scales = (1e3 * amount / _force(units[0]), 1e3 * amount / _force(units[1]))
-    with one_thread():
-        contact, lowest = _contact(solution, scales, res.edge)
-    sys = solution.system
-    faces, elements = surface.cut_faces(mesh.slab_topology(res))
-    probe_faces, probe_elements = surface.cut_faces(mesh.probe_topology(res, len(probe.layers)))
+def _presses(
+    geometries: Sequence[Geometry],
+    levels: Sequence[float],
+    by_force: bool,
+    mechanics: Mechanics,
+    res: Resolution,
+    estimate: bool,
+    progress: Progress | None,
+) -> Iterator[list[Press]]:
+    """The levels of geometries that differ in the inclusion's modulus only."""
+    start = time.perf_counter()
+    tell = progress or (lambda stage, fraction: None)
+    tell("mesh", 0.0)
+    total = 1 + len(geometries) * (len(set(levels)) + 1)
+    done = [0]
+
+    def step(stage: str) -> None:
+        done[0] += 1
+        tell(stage, min(1.0, done[0] / total))
+
+    first = geometries[0]
+    try:
+        with one_thread():
+            model = build(first, res, mechanics == "finite")
+            bare = path(first, model, False)
+            step("without inclusion")
+            for geometry in geometries:
+                full = bare if geometry.inclusion is None else path(geometry, model, True, bare)
+                error = discretisation_error(geometry, res, full, bare) if estimate else np.nan
+                step("error estimate")
+                found: dict[float, Press] = {}
+                for level in sorted(set(levels)):
+                    states = tuple(
+                        p.by_force(1e3 * level / model.share) if by_force else p.to(level)
+                        for p in (full, bare)
+                    )
+                    seconds = time.perf_counter() - start
+                    found[level] = _press(geometry, states, mechanics, res, error, seconds)  # type: ignore[arg-type]
+                    step(f"level {level:g}")
+                yield [found[level] for level in levels]
+            tell("done", 1.0)
+    except Stuck as stuck:
+        raise NotConverged(f"{stuck}; allowed are presses that this mesh can follow") from None
+    except np.linalg.LinAlgError:
+        raise NotModelled(_TOO_UNEVEN) from None
+
+
+def _press(
+    geometry: Geometry,
+    states: tuple[State, State],
+    mechanics: Mechanics,
+    res: Resolution,
+    error: float,
+    seconds: float,
+) -> Press:
+    model = states[0].model
+    contact, lowest = _contact(geometry, states, res.edge)
+    nodes, layout = model.nodes, model.layout
+    faces, elements = surface.cut_faces(slab_topology(layout))
+    probe_faces, probe_elements = surface.cut_faces(probe_topology(layout))
     cut = surface.cut_plane(
-        solution.place,
-        np.vstack([faces, probe_faces + sys.slab_nodes]),
-        sys.material[np.concatenate([elements, probe_elements + sys.slab_elements])],
-        {
-            n: s * u.displacement
-            for n, s, u in zip(("displacement", "displacement_0"), scales, units, strict=True)
-        },
+        model.place,
+        np.vstack([faces, probe_faces + nodes.slab]),
+        materials(layout)[np.concatenate([elements, probe_elements + nodes.slab_cells])],
+        {name: s.moved for name, s in zip(("displacement", "displacement_0"), states, strict=True)},
+        mirror=layout.symmetric[0],
     )
+    closed = all(state.closed.all() for state in states)
+    forces = [1e-3 * model.share * float(state.force.sum()) for state in states]
     return Press(
         contact,
         cut,
-        indentation_mm=scales[0],
-        indentation_0_mm=scales[1],
-        force_N=1e-3 * scales[0] * _force(units[0]),
-        force_0_N=1e-3 * scales[1] * _force(units[1]),
-        chest_force_N=4e-3 * scales[0] * units[0].chest,
+        indentation_mm=states[0].indentation,
+        indentation_0_mm=states[1].indentation,
+        force_N=forces[0],
+        force_0_N=forces[1],
+        chest_force_N=1e-3 * model.share * float(states[0].chest[2]),
         min_pressure_kPa=lowest,
-        dof=sys.tree.size,
-        seconds=time.perf_counter() - start,
+        dof=model.system(states[0].closed).tree.size,
+        seconds=seconds,
+        path="unilateral" if not closed else "sliding" if mechanics == "finite" else "tied",
+        mechanics=mechanics,
+        error_percent=error,
+        _states=states,
+        _geometry=geometry,
     )
 
 
-def _force(unit: Unit) -> float:
-    """Force on the whole contact surface, mN per mm of indentation."""
-    return 4 * float(unit.reaction.sum())
-
-
-def _contact(solution: Solution, scales: tuple[float, float], edge: int) -> tuple[pv.PolyData, float]:
+def _contact(geometry: Geometry, states: tuple[State, State], edge: int) -> tuple[pv.PolyData, float]:
     """The contact surface with its fields, and the smallest pressure on it, kPa."""
-    sys = solution.system
-    x, y = solution.place[sys.tip[:, 0], 0], solution.place[sys.tip[0], 1]
-    contact = surface.contact_surface(surface.mirror_line(x), surface.mirror_line(y))
+    nodes, half = states[0].model.nodes, states[0].model.layout.symmetric
+    at = states[0].model.place[nodes.tip]
+    x, y = at[:, 0, 0], at[0, :, 1]
+    whole_x, whole_y = surface.mirror_line(x, half[0]), surface.mirror_line(y, half[1])
+    contact = surface.contact_surface(whole_x, whole_y, surface.mirror_grid(at[..., 2], symmetric=half))
+    lumped = np.outer(surface.line_weights(whole_x), surface.line_weights(whole_y)).ravel()
     lowest = np.inf
-    for suffix, scale, unit in zip(
-        ("", "_0"), scales, (solution.with_inclusion, solution.without), strict=True
-    ):
-        moved = scale * unit.displacement[sys.tip]
-        pressure = surface.pressure(scale * unit.reaction, x, y, edge)
+    for suffix, state in zip(("", "_0"), states, strict=True):
+        moved = state.moved[nodes.tip]
+        pressure = surface.pressure(np.maximum(state.force, 0.0), x, y, edge, state.closed)
+        stretch = np.ones(pressure.shape)
+        if state.model.finite:  # area that the deformed surface covers, seen along z
+            stretch = np.linalg.det(state.model.interface.derivatives(at + moved)[..., :2])
         if not np.isfinite(pressure).all():
             raise NotModelled(_TOO_UNEVEN)
-        if pressure.min() <= 0:
-            i, j = np.unravel_index(int(pressure.argmin()), pressure.shape)
-            raise NotModelled(
-                f"press: received a contact that opens, {pressure.min():.3g} kPa "
-                f"at ({x[i]:.2f}, {y[j]:.2f}) mm; not modelled yet: allowed is contact that stays closed"
-            )
+        pressure = pressure / stretch
         lowest = min(lowest, float(pressure.min()))
         signs = ((-1, 1), (1, -1), (1, 1))
-        whole = [surface.mirror_grid(moved[..., a], *signs[a]) for a in range(3)]
+        whole = [surface.mirror_grid(moved[..., a], *signs[a], half) for a in range(3)]
         contact.point_data["displacement" + suffix] = np.stack(whole, axis=-1).reshape(-1, 3)
-        contact.point_data["pressure" + suffix] = surface.mirror_grid(pressure).ravel()
+        contact.point_data["pressure" + suffix] = surface.mirror_grid(pressure, symmetric=half).ravel()
+        contact.point_data["area" + suffix] = lumped * surface.mirror_grid(stretch, symmetric=half).ravel()
     return contact, lowest

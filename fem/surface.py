@@ -1,10 +1,13 @@
-"""Meshes to hand on: the whole contact surface and the cut y = 0, mirrored from the solved quarter."""
+"""Meshes to hand on: the whole contact surface and the cut, mirrored where only a part was solved."""
 
 from __future__ import annotations
 
 import numpy as np
 import pyvista as pv
 from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
+from scipy.sparse import coo_matrix
+from scipy.sparse.linalg import spsolve
 from skfem import ElementHex2, MeshHex2
 
 Floats = NDArray[np.float64]
@@ -15,15 +18,21 @@ Ints = NDArray[np.int64]
 _SMALL = np.array([[0, 3, 4, 1], [3, 6, 7, 4], [1, 4, 5, 2], [4, 7, 8, 5]])
 
 
-def mirror_grid(field: Floats, sign_x: float = 1.0, sign_y: float = 1.0) -> Floats:
-    """Extend a field on a grid of the quarter (n, n) to the whole (2 n - 1, 2 n - 1), by its parities."""
-    whole = np.concatenate([sign_x * field[:0:-1], field])
-    return np.concatenate([sign_y * whole[:, :0:-1], whole], axis=1)
+def mirror_grid(
+    field: Floats, sign_x: float = 1.0, sign_y: float = 1.0, symmetric: tuple[bool, bool] = (True, True)
+) -> Floats:
+    """Extend a field on a grid (nx, ny) to the whole footprint by its parities about the symmetry planes at
+    the first nodes."""
+    if symmetric[0]:
+        field = np.concatenate([sign_x * field[:0:-1], field])
+    if symmetric[1]:
+        field = np.concatenate([sign_y * field[:, :0:-1], field], axis=1)
+    return field
 
 
-def mirror_line(x: Floats) -> Floats:
+def mirror_line(x: Floats, symmetric: bool = True) -> Floats:
     """Extend grid lines from x >= 0, shape (n,), to both sides, shape (2 n - 1,)."""
-    return np.concatenate([-x[:0:-1], x])
+    return np.concatenate([-x[:0:-1], x]) if symmetric else x
 
 
 def line_weights(x: Floats) -> Floats:
@@ -36,60 +45,96 @@ def line_weights(x: Floats) -> Floats:
     return weights
 
 
-def _line_mass(x: Floats, lumped: int) -> Floats:
-    """Mass matrix of a line of quadratic elements (n, n), its last `lumped` elements by Simpson's rule."""
-    full = np.array([[4.0, 2.0, -1.0], [2.0, 16.0, 2.0], [-1.0, 2.0, 4.0]]) / 30
-    simpson = np.diag([1.0, 4.0, 1.0]) / 6
-    mass = np.zeros((len(x), len(x)))
-    last = len(x) - 1 - 2 * lumped
-    for i in range(0, len(x) - 2, 2):
-        mass[i : i + 3, i : i + 3] += (full if i < last else simpson) * (x[i + 2] - x[i])
-    return mass
+_CONSISTENT = np.array([[4.0, 2.0, -1.0], [2.0, 16.0, 2.0], [-1.0, 2.0, 4.0]]) / 30
+_SIMPSON = np.diag([1.0, 4.0, 1.0]) / 6
 
 
-def pressure(reaction: Floats, x: Floats, y: Floats, edge: int) -> Floats:
-    """Contact pressure from the nodal reactions on the grid of the quarter.
+def pressure(
+    reaction: Floats, x: Floats, y: Floats, edge: int, closed: NDArray[np.bool_] | None = None
+) -> Floats:
+    """Nominal contact pressure from the nodal reactions on the grid of the footprint.
 
     The consistent load of a pressure p is M p, with M the mass matrix of the contact faces. Dividing by the
     lumped area instead leaves an alternating error of -0.2 p'' H² at an element's corners and +0.1 p'' H² at
     its middle, H its half length: 3 % of the tared peak at standard quality. Solving with M removes it, but
-    rings next to the singularity at the probe's edge. So M is consistent inside and lumped in the
-    `edge` cells next to the probe's edge. Its row sums are the lumped areas either way, so
-    `pressure * area` still sums to the force.
+    rings next to the singularity at the probe's edge, and where contact ends. So M is consistent inside,
+    lumped (Simpson's rule) across the edge in the `edge` cells next to the probe's edge, and lumped around
+    open pairs and wherever it would still give a negative pressure. Its row sums are the lumped areas in any
+    case, so `pressure * area` sums to the force.
 
     Parameters
     ----------
     reaction
-        Nodal forces, mN, shape (n, n).
+        Nodal forces, mN, shape (nx, ny), nowhere negative.
     x, y
-        Grid lines, mm, each (n,), from the symmetry plane to the probe's edge.
+        Grid lines, mm, (nx,) and (ny,); the probe's edge is where |x| or |y| is largest.
+    closed
+        Pairs in contact, (nx, ny); all by default.
 
     Returns
     -------
-    (n, n) array, kPa.
+    (nx, ny) array, kPa, not negative.
     """
-    along_x = np.linalg.solve(_line_mass(x, edge), reaction)
-    return np.asarray(np.linalg.solve(_line_mass(y, edge), along_x.T).T)
+    shape = reaction.shape
+    cells = (shape[0] - 1) // 2, (shape[1] - 1) // 2
+    at_edge = [_edge_cells(line, edge) for line in (x, y)]
+    loose = np.zeros(cells, dtype=bool) if closed is None else _around(~closed)
+    number = np.arange(reaction.size).reshape(shape)
+    nine = np.stack(
+        [number[i : i + 2 * cells[0] : 2, j : j + 2 * cells[1] : 2] for i in range(3) for j in range(3)], -1
+    )
+    size_x, size_y = x[2::2] - x[:-2:2], y[2::2] - y[:-2:2]
+    for _ in range(20):
+        lump_x, lump_y = at_edge[0][:, None] | loose, at_edge[1][None, :] | loose
+        one_x = np.where(lump_x[..., None, None], _SIMPSON, _CONSISTENT) * size_x[:, None, None, None]
+        one_y = np.where(lump_y[..., None, None], _SIMPSON, _CONSISTENT) * size_y[None, :, None, None]
+        mass = np.einsum("mnik,mnjl->mnijkl", one_x, one_y).reshape(*cells, 9, 9)
+        rows = np.broadcast_to(nine[..., :, None], mass.shape)
+        whole = coo_matrix((mass.ravel(), (rows.ravel(), rows.swapaxes(-1, -2).ravel())))
+        found = spsolve(whole.tocsc(), reaction.ravel()).reshape(shape)
+        low = found < 0
+        if not low.any() or loose.all():
+            return np.maximum(found, 0.0) if loose.all() else np.asarray(found)
+        loose = loose | _around(low)
+    return np.maximum(np.asarray(found), 0.0)
 
 
-def contact_surface(x: Floats, y: Floats) -> pv.PolyData:
-    """Flat surface z = 0 of quads on all Q2 nodes, four to a nine-node face, with each node's lumped `area`.
+def _edge_cells(line: Floats, edge: int) -> NDArray[np.bool_]:
+    """Cells of a line next to the probe's edge; on a symmetric half, only at its far end."""
+    count = (len(line) - 1) // 2
+    mask = np.arange(count) >= count - edge
+    return mask if line[0] > -0.5 * line[-1] else mask | mask[::-1]
+
+
+def _around(nodes: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Cells (m, n) that have one of the nodes (2 m + 1, 2 n + 1), or are next to one that has."""
+    m, n = (nodes.shape[0] - 1) // 2, (nodes.shape[1] - 1) // 2
+    hit = np.zeros((m, n), dtype=bool)
+    for i in range(3):
+        for j in range(3):
+            hit |= nodes[i : i + 2 * m : 2, j : j + 2 * n : 2]
+    return binary_dilation(hit, np.ones((3, 3), dtype=bool))
+
+
+def contact_surface(x: Floats, y: Floats, z: Floats | None = None) -> pv.PolyData:
+    """Surface of quads on all Q2 nodes, four to a nine-node face.
 
     Parameters
     ----------
     x, y
-        Coordinates of the grid lines, mm, shape (n,), n odd. Points are ordered x-major: point i * n + j is
-        (x_i, y_j).
+        Coordinates of the grid lines, mm, shape (nx,) and (ny,), odd. Points are ordered x-major: point
+        i * ny + j is (x_i, y_j).
+    z
+        Heights, mm, (nx, ny); flat at 0 by default.
     """
     n = len(y)
-    points = np.stack([*np.meshgrid(x, y, indexing="ij"), np.zeros((len(x), n))], axis=-1).reshape(-1, 3)
+    heights = np.zeros((len(x), n)) if z is None else z
+    points = np.stack([*np.meshgrid(x, y, indexing="ij"), heights], axis=-1).reshape(-1, 3)
     number = np.arange(len(points)).reshape(len(x), n)
     nine = np.stack(
         [number[i : len(x) - 2 + i : 2, j : n - 2 + j : 2] for i in range(3) for j in range(3)], axis=-1
     )
-    surface = pv.PolyData(points, _quads(nine.reshape(-1, 9)))
-    surface.point_data["area"] = np.outer(line_weights(x), line_weights(y)).ravel()
-    return surface
+    return pv.PolyData(points, _quads(nine.reshape(-1, 9)))
 
 
 def _quads(nine: Ints) -> Ints:
@@ -114,8 +159,10 @@ def cut_faces(logical: MeshHex2) -> tuple[Ints, Ints]:
     return np.vstack([f for f, _ in found]), np.concatenate([e for _, e in found])
 
 
-def cut_plane(place: Floats, nine: Ints, material: Ints, fields: dict[str, Floats]) -> pv.PolyData:
-    """The cut y = 0, mirrored in x, of quads on all Q2 nodes.
+def cut_plane(
+    place: Floats, nine: Ints, material: Ints, fields: dict[str, Floats], mirror: bool = True
+) -> pv.PolyData:
+    """The cut through the middle of probe and inclusion, mirrored in x by default, of quads on all Q2 nodes.
 
     Parameters
     ----------
@@ -126,8 +173,16 @@ def cut_plane(place: Floats, nine: Ints, material: Ints, fields: dict[str, Float
     fields
         Vectors on all nodes (nodes, 3); x is odd under the mirror.
     """
+    _, first = np.unique(np.sort(nine, axis=1), axis=0, return_index=True)
+    nine, material = nine[np.sort(first)], material[np.sort(first)]  # inside a body, a face has two elements
     used, inverse = np.unique(nine, return_inverse=True)
     nine = inverse.reshape(nine.shape)
+    if not mirror:
+        cut = pv.PolyData(place[used], _quads(nine))
+        for name, values in fields.items():
+            cut.point_data[name] = values[used]
+        cut.cell_data["material"] = np.repeat(material, 4)
+        return cut
     n = len(used)
     axis = np.abs(place[used, 0]) < 1e-9
     twin = np.where(axis, np.arange(n), n + np.cumsum(~axis) - 1)

@@ -1,48 +1,45 @@
-"""The unknowns of a press: which node moves how, what is tied, what is held; and its unit solution.
+"""The unknowns of a press: which node moves how, which pairs are in contact, what is held.
 
-The probe and the slab are two meshes. Frictionless contact that stays closed is a tie of the normal
-displacement alone: the probe's contact nodes share their z unknown with the slab's nodes under them, x and y
-stay free of each other. Everything is solved in the probe's frame for one millimetre of indentation: the
-glass at rest, the chest wall moving by -1 mm in z; linear elasticity scales the rest.
+The probe and the slab are two meshes side by side. Where a pair of contact nodes is closed, the probe's node
+takes its z unknown from the slab's, x and y stay free of each other (`fem.contact` adds what sliding
+changes). All is solved in the probe's frame: the glass at rest, the chest wall moving against it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fem import elasticity, mesh, solver
-from fem.mesh import Resolution
-from fem.model import Inclusion, Probe, Slab
+from fem import solver
+from fem.quadrature import DOFS
+from fem.topology import Layout, materials, probe_topology, slab_topology
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class System:
-    """Topology of a press; fixed by resolution and number of layers. Probe nodes follow slab nodes."""
+class Nodes:
+    """Nodes of both bodies, the slab's first."""
 
-    local: Ints  # dof 3 * node + axis of each element's local dofs; (elements, 81)
-    dofs: Ints  # its unknown, -1 where held; (elements, 81)
-    unknown: Ints  # unknown of each dof 3 * node + axis, -1 where held; (3 nodes,)
-    chest: Ints  # slab nodes on the chest wall
-    contact: Ints  # slab nodes of the footprint as a grid, (2 n + 1, 2 n + 1), x along the first axis
+    cells: Ints  # (m, 27)
+    contact: Ints  # the slab's nodes of the footprint, (nx, ny), x along the first axis
     tip: Ints  # the probe's nodes on them
-    material: Ints  # 0 tissue, 1 inclusion, 2, 3, ... layers; (elements,)
-    slab_elements: int
-    slab_nodes: int
-    tree: solver.Tree
+    chest: Ints  # the slab's nodes on the chest wall
+    held: Bools  # (nodes, 3)
+    slab: int  # number of the slab's nodes
+    slab_cells: int
+    centres: Floats  # logical middles of the elements, the probe hung on the slab, (m, 3)
 
 
-@lru_cache(maxsize=8)
-def system(res: Resolution, layers: int) -> System:
-    """Number the unknowns and plan their elimination."""
-    slab, probe = mesh.slab_topology(res), mesh.probe_topology(res, layers)
+@lru_cache(maxsize=16)
+def nodes(layout: Layout, sides: str) -> Nodes:
+    """Find the nodes that touch and those that are held."""
+    slab, probe = slab_topology(layout), probe_topology(layout)
     place = np.hstack([slab.doflocs, probe.doflocs])
     split = slab.doflocs.shape[1]
     in_slab = np.arange(place.shape[1]) < split
@@ -50,110 +47,74 @@ def system(res: Resolution, layers: int) -> System:
     chest = np.flatnonzero(in_slab & (z == z[in_slab].max()))
     glass = np.flatnonzero(~in_slab & (z == z[~in_slab].min()))
     rim = x[~in_slab].max()
-    under = np.flatnonzero(in_slab & (z == z[in_slab].min()) & (x < rim + 1e-9) & (y < rim + 1e-9))
+    under = np.flatnonzero(
+        in_slab & (z == z[in_slab].min()) & (np.abs(x) < rim + 1e-9) & (np.abs(y) < rim + 1e-9)
+    )
     touch = np.flatnonzero(~in_slab & (z == 0))
-    contact, tip = (_as_grid(nodes, place) for nodes in (under, touch))
-
     held = np.zeros((place.shape[1], 3), dtype=bool)
     held[chest] = held[glass] = True
-    held[np.abs(x) < 1e-9, 0] = True
-    held[np.abs(y) < 1e-9, 1] = True
-    master = np.arange(held.size).reshape(held.shape)
-    master[tip, 2] = master[contact, 2]
-    free = np.zeros(held.size, dtype=bool)
-    free[master[~held]] = True
+    for axis, symmetric in enumerate(layout.symmetric):
+        if symmetric:
+            held[np.abs(place[axis]) < 1e-9, axis] = True
+        if sides == "symmetric":
+            held[in_slab & (np.abs(place[axis]) > place[axis, in_slab].max() - 1e-9), axis] = True
+    cells = [m.dofs.element_dofs.T.astype(np.int64) for m in (slab, probe)]
+    middles = [m.p[:, m.t].mean(axis=1) for m in (slab, probe)]
+    middles[1][2] += slab.p[2].min()  # hang the probe on the slab, so that neighbours are neighbours
+    return Nodes(
+        np.vstack([cells[0], cells[1] + split]),
+        _as_grid(under, place),
+        _as_grid(touch, place),
+        chest,
+        held,
+        split,
+        len(cells[0]),
+        np.hstack(middles).T,
+    )
+
+
+def _as_grid(found: Ints, place: Floats) -> Ints:
+    """Nodes of a plane z = constant that form a tensor grid, as an array indexed by x, then y."""
+    order = np.lexsort((np.round(place[1, found], 6), np.round(place[0, found], 6)))
+    columns = len(np.unique(np.round(place[0, found], 6)))
+    return found[order].reshape(columns, -1)
+
+
+@dataclass(frozen=True)
+class System:
+    """Numbered unknowns for one set of closed pairs."""
+
+    nodes: Nodes
+    closed: Bools  # pairs in contact, (nx, ny)
+    unknown: Ints  # unknown of each dof 3 * node + axis, -1 where held; (3 nodes,)
+    tree: solver.Tree
+
+    def expand(self, values: Floats) -> Floats:
+        """Displacements (nodes, 3) of values of the unknowns; held ones are 0."""
+        return np.append(values, 0.0)[self.unknown].reshape(-1, 3)
+
+    def gather(self, forces: Floats) -> Floats:
+        """Forces on the unknowns, the transpose of `expand`."""
+        free = self.unknown >= 0
+        found = np.bincount(self.unknown[free], weights=forces.ravel()[free], minlength=self.tree.size)
+        return np.asarray(found, dtype=float)
+
+
+@lru_cache(maxsize=4)
+def _system(layout: Layout, sides: str, key: bytes) -> System:
+    found = nodes(layout, sides)
+    closed = np.frombuffer(key, dtype=bool).reshape(found.contact.shape)
+    master = np.arange(found.held.size).reshape(found.held.shape)
+    master[found.tip[closed], 2] = master[found.contact[closed], 2]
+    free = np.zeros(found.held.size, dtype=bool)
+    free[master[~found.held]] = True
     number = np.where(free, np.cumsum(free) - 1, -1)
     unknown = number[master].ravel()
-
-    local = np.vstack([elasticity.element_dofs(slab), elasticity.element_dofs(probe) + 3 * split])
-    material = np.concatenate([mesh.slab_materials(res), mesh.probe_materials(res, layers)])
-    drop = slab.p[2].min()  # hang the probe on the slab, so that neighbours are neighbours
-    middles = [m.p[:, m.t].mean(axis=1) for m in (slab, probe)]
-    middles[1][2] += drop
-    centres = np.hstack(middles).T
-    tree = solver.plan(unknown[local], centres, material == 1)
-    return System(local, unknown[local], unknown, chest, contact, tip, material, slab.t.shape[1], split, tree)
+    local = (3 * found.cells[:, :, None] + np.arange(3)).reshape(-1, DOFS)
+    tree = solver.plan(unknown[local], found.centres, materials(layout) == 1)
+    return System(found, closed, unknown, tree)
 
 
-def _as_grid(nodes: Ints, place: Floats) -> Ints:
-    """Nodes of a plane z = constant that form a tensor grid, as an array indexed by x, then y."""
-    order = np.lexsort((np.round(place[1, nodes], 6), np.round(place[0, nodes], 6)))
-    side = round(len(nodes) ** 0.5)
-    return nodes[order].reshape(side, side)
-
-
-@dataclass(frozen=True)
-class Unit:
-    """Solution for one millimetre of indentation, quarter model, probe's frame."""
-
-    displacement: Floats  # (nodes, 3), mm per mm
-    reaction: Floats  # force of the probe on the slab at each node of `contact`, mN per mm, positive pressing
-    chest: float  # force of the slab on the quarter of the chest wall, mN per mm, positive pressing
-
-
-@dataclass(frozen=True)
-class Solution:
-    """Unit solutions on one mesh with and without the inclusion."""
-
-    system: System
-    place: Floats  # (nodes, 3) undeformed, mm
-    with_inclusion: Unit
-    without: Unit
-
-
-def solve(
-    probe: Probe,
-    slab: Slab,
-    inclusion: Inclusion | None,
-    res: Resolution,
-    progress: Callable[[str, float], None] = lambda stage, fraction: None,
-) -> Solution:
-    """Solve with and without the inclusion on the mesh that fits it; call it under `solver.one_thread`."""
-    progress("mesh", 0.0)
-    box = mesh.box_around(inclusion, probe, slab)
-    slab_mesh, probe_mesh = mesh.morph_slab(res, box, probe, slab), mesh.morph_probe(res, box, probe, slab)
-    progress("plan", 0.03)
-    sys = system(res, len(probe.layers))
-    place = np.hstack([slab_mesh.doflocs, probe_mesh.doflocs]).T
-
-    progress("stiffness", 0.1)
-    modulus = np.array([slab.modulus_kPa, slab.modulus_kPa, *(layer.modulus_kPa for layer in probe.layers)])
-    poisson = np.array([slab.poisson, slab.poisson, *(layer.poisson for layer in probe.layers)])
-    cut = sys.slab_elements
-    parts = ((slab_mesh, sys.material[:cut]), (probe_mesh, sys.material[cut:]))
-    matrices = np.concatenate([elasticity.stiffness(m, modulus[of], poisson[of]) for m, of in parts])
-    progress("factorise", 0.25)
-    factor = solver.Factor(sys.tree, matrices, progress=lambda f: progress("factorise", 0.25 + 0.6 * f))
-    progress("solve", 0.85)
-    without = _unit(sys, factor)
-    if inclusion is None:
-        progress("done", 1.0)
-        return Solution(sys, place, without, without)
-    progress("inclusion", 0.9)
-    ball = np.flatnonzero(sys.material == 1)
-    stiff = np.full(len(ball), inclusion.modulus), np.full(len(ball), inclusion.poisson)
-    matrices = matrices.copy()
-    matrices[ball] = elasticity.stiffness(slab_mesh, *stiff, elements=ball)
-    unit = _unit(sys, solver.Factor(sys.tree, matrices, base=factor))
-    progress("done", 1.0)
-    return Solution(sys, place, unit, without)
-
-
-def _unit(sys: System, factor: solver.Factor) -> Unit:
-    """Lower the chest wall by one millimetre onto the probe."""
-    held = np.zeros(len(sys.unknown))
-    held[3 * sys.chest + 2] = -1.0
-    x = factor.solve(-_scatter(sys, factor.matrices, held)[0])
-    full = np.where(sys.unknown >= 0, np.append(x, 0.0)[sys.unknown], held)
-    force = _scatter(sys, factor.matrices, full)[1]
-    return Unit(full.reshape(-1, 3), force[sys.contact, 2], -float(force[sys.chest, 2].sum()))
-
-
-def _scatter(sys: System, matrices: Floats, full: Floats) -> tuple[Floats, Floats]:
-    """Internal forces of a displacement: on the unknowns (unknowns,), of the slab on its nodes (nodes, 3)."""
-    force = (matrices @ full[sys.local][:, :, None])[:, :, 0]
-    free = sys.dofs >= 0
-    total = np.bincount(sys.dofs[free], weights=force[free], minlength=sys.tree.size)
-    cut = sys.slab_elements
-    slab = np.bincount(sys.local[:cut].ravel(), weights=force[:cut].ravel(), minlength=3 * sys.slab_nodes)
-    return np.asarray(total, dtype=float), np.asarray(slab, dtype=float).reshape(-1, 3)
+def system(layout: Layout, sides: str, closed: Bools) -> System:
+    """Number the unknowns and plan their elimination; closed pairs (nx, ny) share their z unknown."""
+    return _system(layout, sides, np.ascontiguousarray(closed, dtype=bool).tobytes())

@@ -1,0 +1,355 @@
+"""Equilibrium of probe and slab: Newton's method on the forces, conjugate gradients on the tangent, active
+set.
+
+The tangent is applied element by element and never assembled; a Cholesky factor of an earlier tangent
+(`fem.solver`) preconditions it, so that most Newton steps need no factorisation at all. Which pairs of
+contact nodes are closed is iterated around it (primal-dual active set: Hüeber and Wohlmuth 2005;
+[hueber2005]): closed pairs that pull are opened, open pairs that overlap are closed, until neither is left.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse.linalg import LinearOperator, cg
+
+from fem import elasticity, solver
+from fem.contact import Interface, Tie, tie
+from fem.elasticity import Inverted
+from fem.quadrature import DOFS, Quadrature
+from fem.system import Nodes, System, system
+from fem.topology import Layout
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.int64]
+
+_TOLERANCE = 1e-9  # of the residual, relative to the reaction at the chest wall
+_FORCING = 1e-3  # to which conjugate gradients solve each Newton step
+_HALVINGS = 8  # of a Newton step at most
+_NEWTON = 25  # steps at most
+_PATIENCE = 12  # steps after which the residual must have come down to a hundredth of the reaction
+_WORTH = 15  # iterations of conjugate gradients that are worth a new factor
+_CHUNK = 128  # element matrices made double at a time
+_TURNS, _RELAX = 5, 0.7
+_LOOSE = 3e-4  # tolerance while the tie still changes
+_TURN = 1e-3  # change of the contact's slope that is left, in shares of the largest force
+_SETS = 40  # changes of the active set at most
+
+
+class NotConverged(ArithmeticError):
+    """Newton's method or the active set found no equilibrium in this step."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """Probe and slab in real coordinates, without the moduli of the slab's contents."""
+
+    layout: Layout
+    sides: str
+    nodes: Nodes
+    interface: Interface
+    quad: Quadrature
+    place: Floats  # undeformed nodes, (nodes, 3) mm
+    shift: Floats  # of the slab's nodes under the probe's, within the slab's surface, (nx, ny, 2) mm
+    normal: Floats  # direction of the press in the probe's frame, (3,)
+    ball: NDArray[np.int64]  # elements of the inclusion
+    finite: bool  # finite strain with sliding contact, or linear elasticity
+
+    def chest(self, indentation: float) -> Floats:
+        """Displacements that are held, (nodes, 3) mm: the chest wall comes nearer by the indentation."""
+        moved = np.zeros_like(self.place)
+        moved[self.nodes.chest] = -indentation * self.normal
+        return moved
+
+    @property
+    def slab(self) -> Floats:
+        """1 at the slab's nodes, 0 at the probe's; (nodes, 1)."""
+        return (np.arange(len(self.place)) < self.nodes.slab)[:, None].astype(float)
+
+    @property
+    def share(self) -> int:
+        """How many times the part that is meshed makes up the whole."""
+        return 2 ** sum(self.layout.symmetric)
+
+    def system(self, closed: Bools) -> System:
+        return system(self.layout, self.sides, closed)
+
+    def settle(self, moved: Floats, closed: Bools, bond: Tie) -> None:
+        """Put the probe's closed nodes onto the slab's surface, in place."""
+        distance = bond.gap(self.place + moved)
+        moved[self.nodes.tip, 2] += np.where(closed, distance, 0.0)
+
+    def nodal(self, forces: Floats) -> Floats:
+        """Sum of element forces (m, 27, 3) at the nodes, (nodes, 3)."""
+        dofs = (3 * self.nodes.cells[:, :, None] + np.arange(3)).ravel()
+        total = np.bincount(dofs, weights=forces.ravel(), minlength=self.place.size)
+        return np.asarray(total, dtype=float).reshape(-1, 3)
+
+
+@dataclass(frozen=True)
+class State:
+    """One equilibrium."""
+
+    indentation: float  # mm
+    moved: Floats  # displacement of the nodes in the probe's frame, (nodes, 3) mm
+    closed: Bools  # pairs in contact, (nx, ny)
+    force: Floats  # of the probe on the slab along z at each pair, mN, positive pressing; (nx, ny)
+    chest: Floats  # of the slab on the chest wall, (3,) mN
+    model: Model  # the mesh it belongs to
+    tie: Tie
+
+
+@dataclass
+class Effort:
+    """What finding the equilibria took."""
+
+    factors: int = 0
+    newton: int = 0
+    cg: int = 0
+    sets: int = 0
+
+
+@dataclass(frozen=True)
+class Stiffness:
+    """Element matrices (m, 81, 81), those of some elements replaced: what bodies share is stored once."""
+
+    matrices: NDArray[np.floating]
+    other: Ints | None = None
+    instead: NDArray[np.floating] | None = None
+
+    def __call__(self, elements: Ints) -> NDArray[np.floating]:
+        """Matrices of some elements."""
+        found = self.matrices[elements]
+        if self.other is not None and self.instead is not None:
+            at = np.searchsorted(self.other, elements)
+            hit = self.other[np.minimum(at, len(self.other) - 1)] == elements
+            found[hit] = self.instead[at[hit]]
+        return found
+
+    def sheared(self, cells: Ints, slope: Floats) -> Stiffness:
+        """In the unknowns x, y and z - G . (x, y) at each node; slope G (nodes, 2)."""
+        touched = np.flatnonzero(np.abs(slope[cells]).max(axis=(1, 2)) > 0)
+        some = self(touched).copy()
+        g = slope[cells[touched]].astype(some.dtype)  # (n, 27, 2)
+        for a in (0, 1):
+            some[:, :, a::3] += some[:, :, 2::3] * g[:, None, :, a]
+            some[:, a::3] += some[:, 2::3] * g[:, :, a, None]
+        return Stiffness(self.matrices, touched, some)
+
+
+@dataclass
+class Body:
+    """All moduli, and the factors found so far."""
+
+    shear: Floats
+    bulk: Floats
+    rest: Stiffness  # of the undeformed elements
+    finite: bool
+    stiff: bool  # with the inclusion
+    factors: dict[bytes, Preconditioner] = field(default_factory=dict)
+    effort: Effort = field(default_factory=Effort)
+
+    @cached_property
+    def floor(self) -> float:
+        """Residual that is rounding, mN: what the largest entries leave after they cancel."""
+        kind, largest = self.rest.matrices.dtype, float(np.abs(self.rest.matrices).max())
+        double = kind == np.float64 or self.finite  # finite strain's forces do not come from the matrices
+        return (1e4 * float(np.finfo(np.float64).eps) if double else 20 * float(np.finfo(kind).eps)) * largest
+
+    def forces(self, model: Model, moved: Floats) -> tuple[Floats, float]:
+        """Internal forces (nodes, 3), mN, and stored energy, µJ."""
+        if model.finite:
+            found, energy = elasticity.forces(model.quad, moved, self.shear, self.bulk)
+            return model.nodal(found), energy
+        total = model.nodal(product(self.rest, moved, model))
+        return total, 0.5 * float((total * moved).sum())
+
+    def tangent(self, model: Model, moved: Floats) -> Stiffness:
+        """Tangent stiffness of the elements."""
+        if not model.finite:
+            return self.rest
+        return Stiffness(elasticity.stiffness(model.quad, self.shear, self.bulk, moved, dtype=np.float32))
+
+    def factor(
+        self, sys: System, matrices: Stiffness, slope: Floats | None = None, renew: bool = False
+    ) -> Preconditioner:
+        """Factor of the tied stiffness for a set of closed pairs; an old one serves unless renewed."""
+        key = sys.closed.tobytes()
+        if renew or key not in self.factors:
+            self.factors.clear()
+            made = matrices if slope is None else matrices.sheared(sys.nodes.cells, slope)
+            self.factors[key] = Preconditioner(sys, solver.Factor(sys.tree, made), slope)
+            self.effort.factors += 1
+        return self.factors[key]
+
+
+@dataclass(frozen=True)
+class Preconditioner:
+    """Factor of a stiffness in which closed pairs are tied across their tangent plane.
+
+    With slopes G, the unknown that a pair shares is the height z - G . (x, y) above that plane.
+    """
+
+    sys: System
+    factor: solver.Factor
+    slope: Floats | None  # G of each node, (nodes, 2); zero off the contact
+
+    def __call__(self, load: Floats) -> Floats:
+        """One substitution."""
+        if self.slope is None:
+            return self.factor.precondition(load)
+        at, unknown = self.sys.nodes.contact.ravel(), self.sys.unknown.reshape(-1, 3)
+        rise = unknown[at, 2]
+        pairs = [(unknown[at, a], self.slope[at, a]) for a in (0, 1)]
+        turned = load.copy()
+        for level, g in pairs:
+            free = level >= 0
+            turned[level[free]] += (g * load[rise])[free]
+        found = self.factor.precondition(turned)
+        lift = found[rise].copy()
+        for level, g in pairs:
+            free = level >= 0
+            lift[free] += (g[free]) * found[level[free]]
+        found[rise] = lift
+        return found
+
+
+def product(matrices: Stiffness, moved: Floats, model: Model) -> Floats:
+    """Forces (m, 27, 3) of element matrices on displacements (nodes, 3); sums are double in any case."""
+    local = moved[model.nodes.cells].reshape(-1, DOFS, 1)
+    force = np.empty_like(local)
+    for start in range(0, len(local), _CHUNK):
+        part = np.arange(start, min(start + _CHUNK, len(local)))
+        some = matrices(part).astype(np.float64, copy=False)
+        np.matmul(some, local[part], out=force[start : start + len(part)])
+    return force.reshape(-1, 27, 3)
+
+
+def equilibrium(body: Body, guess: State) -> State:
+    """Find the equilibrium at `guess.indentation`, from its displacements and its closed pairs.
+
+    Raises
+    ------
+    NotConverged, Inverted
+        The step was too long.
+    """
+    model, state = guess.model, replace(guess, moved=guess.moved.copy())
+    held = model.nodes.held
+    state.moved[held] = np.where(held, model.chest(guess.indentation), 0.0)[held]
+    seen: set[bytes] = set()
+    turns, held_fast = 0, not model.finite
+    for _ in range(_SETS):
+        if not held_fast:
+            share = 1.0 if turns == 0 else _RELAX
+            state = replace(state, tie=tie(model.interface, model.place + state.moved, state.tie, share))
+            turns += 1
+        before = state.force
+        state = _newton(body, state, _TOLERANCE if held_fast else _LOOSE)
+        off = float(np.abs(state.force - before).max(initial=0.0))
+        distance = state.tie.gap(model.place + state.moved)
+        pulls = state.closed & (state.force < 0)
+        overlaps = ~state.closed & (distance < 0)
+        if not (pulls.any() or overlaps.any()):
+            if held_fast:
+                return state
+            held_fast = turns >= _TURNS or off <= _TURN * float(np.abs(state.force).max(initial=0.0))
+            continue
+        closed = (state.closed & ~pulls) | overlaps
+        key = closed.tobytes()
+        if key in seen:  # going round in circles: change one pair at a time, the worst
+            closed = state.closed.copy()
+            worst = np.where(pulls, state.force / np.abs(state.force).max(initial=1e-300), 0.0)
+            worst = np.where(overlaps, distance / np.abs(distance).max(), worst)
+            at = np.unravel_index(int(worst.argmin()), worst.shape)
+            closed[at] = ~closed[at]
+            key = closed.tobytes()
+        seen.add(key)
+        state = replace(state, closed=closed)
+        body.effort.sets += 1
+    raise NotConverged("the set of closed contact pairs does not settle")
+
+
+def _newton(body: Body, start: State, tolerance: float) -> State:
+    """Equilibrium for a given set of closed pairs and slopes."""
+    model, closed, moved, bond = start.model, start.closed, start.moved, start.tie
+    sys = model.system(closed)
+    tip, at_chest = model.nodes.tip, model.nodes.chest
+    model.settle(moved, closed, bond)
+    forces, energy = body.forces(model, moved)
+    renew = False
+    for turn in range(_NEWTON):
+        normal = np.where(closed, forces[tip, 2], 0.0)
+        residual = sys.gather(bond.hand_on(forces, normal))
+        size, scale = float(np.linalg.norm(residual)), float(np.linalg.norm(forces[at_chest]))
+        if size <= max(tolerance * scale, body.floor):
+            return replace(start, moved=moved, force=-normal, chest=-forces[at_chest].sum(axis=0))
+        if turn >= _PATIENCE and size > 1e-2 * scale:
+            raise NotConverged("Newton's method does not come down")
+        matrices = body.tangent(model, moved)
+        factor = body.factor(sys, matrices, bond.slopes(len(moved)) if model.finite else None, renew)
+        change, steps, downhill = _solve(body, model, sys, bond, matrices, factor, -residual)
+        renew = model.finite and steps > _WORTH
+        body.effort.newton += 1
+        # far from equilibrium, no step may raise the energy (Armijo's rule); near it rounding would decide
+        for cut in range(_HALVINGS):
+            trial = moved + 0.5**cut * change
+            try:
+                forces_t, energy_t = body.forces(model, trial)
+            except Inverted:
+                continue
+            if not model.finite or size < 1e-3 * scale or energy_t <= energy - 1e-4 * 0.5**cut * downhill:
+                break
+        else:
+            raise NotConverged("no step lowers the energy")
+        moved, forces, energy = trial, forces_t, energy_t
+    raise NotConverged("Newton's method does not converge")
+
+
+def _solve(
+    body: Body,
+    model: Model,
+    sys: System,
+    bond: Tie,
+    matrices: Stiffness,
+    factor: Preconditioner,
+    load: Floats,
+) -> tuple[Floats, int, float]:
+    """Change of the displacements (nodes, 3) that a load on the unknowns makes, the iterations taken, and
+    the work of the load."""
+    tip = model.nodes.tip
+
+    def expand(values: Floats) -> Floats:
+        change = sys.expand(values)
+        change[tip, 2] = np.where(sys.closed, bond.height(change), change[tip, 2])
+        return change
+
+    if not model.finite:
+        answer = factor.factor.solve(load, matrices=matrices)
+        return expand(answer), 1, float(load @ answer)
+
+    def apply(values: Floats) -> Floats:
+        force = model.nodal(product(matrices, expand(values), model))
+        return sys.gather(bond.hand_on(force, np.where(sys.closed, force[tip, 2], 0.0)))
+
+    count = [0]
+
+    def tick(_: Floats) -> None:
+        count[0] += 1
+
+    shape = (len(load), len(load))
+    answer, failed = cg(
+        LinearOperator(shape, matvec=apply, dtype=float),
+        load,
+        rtol=_FORCING,
+        maxiter=200,
+        M=LinearOperator(shape, matvec=factor, dtype=float),
+        callback=tick,
+    )
+    body.effort.cg += count[0]
+    if failed:
+        raise NotConverged("the tangent is not positive definite")
+    return expand(answer), count[0], float(load @ answer)

@@ -1,0 +1,247 @@
+"""Follow a press: from the first touch through all press levels, with steps that cut themselves back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fem import elasticity, mesh
+from fem.contact import Interface, level, line
+from fem.elasticity import Inverted
+from fem.equilibrium import Body, Model, NotConverged, State, Stiffness, equilibrium, product
+from fem.mesh import Geometry
+from fem.quadrature import Quadrature, join, quadrature
+from fem.system import nodes
+from fem.topology import Resolution, materials
+
+Floats = NDArray[np.float64]
+
+_LONGEST = 1.0  # mm of indentation in one step
+_MANY = 4500  # elements from which on their stiffness is kept in single precision
+_SECANT, _FORCE = 25, 1e-9  # steps to find a force, and how well to meet it
+_CUTS = 9  # halvings of a step at most
+
+
+def build(geometry: Geometry, res: Resolution, finite: bool, shift: Floats | None = None) -> Model:
+    """Mesh a geometry; `shift` as in `mesh.morph_slab`."""
+    layout = geometry.layout(res)
+    slab, probe = mesh.morph_slab(layout, geometry, shift), mesh.morph_probe(layout, geometry)
+    found = nodes(layout, geometry.slab.sides)
+    place = np.hstack([slab.doflocs, probe.doflocs]).T
+    x, y = place[found.tip[:, 0], 0], place[found.tip[0], 1]
+    return Model(
+        layout,
+        geometry.slab.sides,
+        found,
+        Interface(found.contact, found.tip, line(x), line(y), layout.symmetric),
+        join([quadrature(slab), quadrature(probe)]),
+        place,
+        np.zeros((*found.tip.shape, 2)) if shift is None else shift,
+        mesh.rotation(geometry.pose.tilt_deg).T[:, 2],
+        np.flatnonzero(materials(layout) == 1),
+        finite,
+    )
+
+
+def follow(geometry: Geometry, model: Model, shift: Floats) -> Model:
+    """The same model with the slab's contact nodes moved within its surface, to where the probe's nodes
+    are."""
+    slab = mesh.morph_slab(model.layout, geometry, shift)
+    quad, place, cut = quadrature(slab), model.place.copy(), model.nodes.slab_cells
+    place[: model.nodes.slab] = slab.doflocs.T
+    probe = model.quad.part(np.arange(cut, model.quad.size))
+    fields = (np.concatenate([getattr(quad, f), getattr(probe, f)]) for f in ("inverse", "weight", "modes"))
+    return replace(model, quad=Quadrature(model.quad.nodes, *fields), place=place, shift=shift)
+
+
+def moduli(geometry: Geometry, model: Model, inclusion: bool) -> tuple[Floats, Floats]:
+    """Shear and bulk modulus of each element, kPa; the slab's own in place of the inclusion if it is left
+    out."""
+    probe, slab = geometry.probe, geometry.slab
+    inner = geometry.inclusion if inclusion and geometry.inclusion is not None else None
+    ball = (slab.modulus_kPa, slab.poisson) if inner is None else (inner.modulus, inner.poisson)
+    table = [(slab.modulus_kPa, slab.poisson), ball, *((la.modulus_kPa, la.poisson) for la in probe.layers)]
+    modulus, poisson = np.array(table).T[:, materials(model.layout)]
+    return elasticity.lame(modulus, poisson)
+
+
+@dataclass
+class Path:
+    """Equilibria of one body, found one after the other."""
+
+    geometry: Geometry
+    body: Body
+    states: list[State]
+    beside: Path | None = None
+    """The same press without inclusion: its states are where to begin, and give the mesh."""
+    slide: Floats | None = None
+    """How far the slab's contact nodes follow per mm of indentation, (nx, ny, 2)."""
+    linear: Path | None = None
+    """The same press in small strain."""
+    _rate: Floats | None = None
+
+    def to(self, indentation: float) -> State:
+        """Equilibrium at an indentation, mm.
+
+        Raises
+        ------
+        NotConverged
+            If even the shortest step fails.
+        """
+        if self.beside is not None:
+            try:
+                other = self.beside.to(indentation)
+                self.states.append(equilibrium(self.body, self._aside(other)))
+                return self.states[-1]
+            except (NotConverged, Inverted, np.linalg.LinAlgError):
+                pass  # go all the way on its own feet
+        near = min(self.states, key=lambda s: abs(s.indentation - indentation))
+        shortest = max(abs(indentation - near.indentation), 1e-3) / 2**_CUTS
+        step = float(np.clip(indentation - near.indentation, -_LONGEST, _LONGEST))
+        while near.indentation != indentation:
+            left = indentation - near.indentation
+            target = indentation if abs(step) >= abs(left) * (1 - 1e-9) else near.indentation + step
+            try:
+                near = equilibrium(self.body, self._ahead(near, target))
+            except (NotConverged, Inverted, np.linalg.LinAlgError):
+                step /= 2
+                if abs(step) < shortest:
+                    raise NotConverged(
+                        f"press: no equilibrium found beyond {near.indentation:.3g} mm on the way to "
+                        f"{indentation:.3g} mm"
+                    ) from None
+                continue
+            self.states.append(near)
+        return near
+
+    def _ahead(self, near: State, indentation: float) -> State:
+        """Extrapolate the path to an indentation, on the mesh that follows the slip expected there."""
+        known = self._line(near, indentation)
+        if len(known) == 1 and near.closed.all():
+            moved = near.moved + self.rate() * (indentation - near.indentation)
+        elif len(known) == 1 and near.model.finite:  # nothing touches yet: begin where small strain ends
+            if self.linear is None:
+                small = replace(near.model, finite=False)
+                self.linear = path(self.geometry, small, self.body.stiff)
+            begun = self.linear.to(indentation)
+            return replace(begun, model=near.model)
+        elif len(known) == 1:  # the slab comes nearer as a whole
+            moved = near.moved - (indentation - near.indentation) * near.model.normal * near.model.slab
+        else:
+            x = np.array([s.indentation for s in known])
+            weights = [
+                np.prod([(indentation - x[j]) / (x[i] - x[j]) for j in range(len(x)) if j != i])
+                for i in range(len(x))
+            ]
+            moved = np.asarray(sum(w * s.moved for w, s in zip(weights, known, strict=True)))
+        guess = replace(near, indentation=indentation, moved=moved)
+        return replace(guess, model=self._model(indentation)) if near.model.finite else guess
+
+    def by_force(self, force: float) -> State:
+        """Equilibrium under a force along z on the part that is meshed, mN.
+
+        Raises
+        ------
+        NotConverged
+            If no indentation gives that force.
+        """
+        first = self.states[0]
+
+        def error(state: State) -> float:
+            return float(state.force.sum()) - force
+
+        known = [s for s in self.states if s is not first]
+        state = min(known, key=lambda s: abs(error(s))) if known else self.to(first.indentation + 0.5)
+        before = first
+        for _ in range(_SECANT):
+            if abs(error(state)) <= _FORCE * force:
+                return state
+            slope = (error(state) - error(before)) / (state.indentation - before.indentation)
+            if not slope > 0:
+                break
+            wish = state.indentation - error(state) / slope
+            wish = max(wish, 0.5 * (first.indentation + state.indentation))
+            before, state = state, self.to(wish)
+        raise NotConverged("press: no indentation found that gives the force")
+
+    def _model(self, indentation: float) -> Model:
+        """The mesh for an indentation: contact nodes of the slab where the linear solution slides them to."""
+        first = self.states[0]
+        if not first.closed.all() or not first.model.layout.res.side:
+            return first.model
+        if self.slide is None:
+            apart = self.rate()
+            apart = (apart[first.model.nodes.tip] - apart[first.model.nodes.contact])[..., :2]
+            # lines move as a whole: what a corner does alone is left to the mortar
+            along_x, along_y = apart[..., 0].mean(axis=1), apart[..., 1].mean(axis=0)
+            self.slide = np.stack(np.broadcast_arrays(along_x[:, None], along_y), axis=-1)
+        return follow(self.geometry, first.model, indentation * self.slide)
+
+    def _line(self, near: State, indentation: float) -> list[State]:
+        """Up to three states to extrapolate from, none of them nearer to the next than the way to go."""
+        known, way = [near], abs(indentation - near.indentation)
+        behind = [
+            s
+            for s in self.states
+            if (s.indentation - near.indentation) * (indentation - near.indentation) < 0
+        ]
+        for state in sorted(behind, key=lambda s: abs(s.indentation - near.indentation)):
+            if abs(state.indentation - known[-1].indentation) >= 0.99 * way and len(known) < 3:
+                known.append(state)
+        return known if len(known) > 1 else [near, *behind[:1]]
+
+    def _aside(self, other: State) -> State:
+        """Guess from the state without inclusion and the difference that the inclusion made before."""
+        assert self.beside is not None
+        pairs = [
+            (s, o)
+            for s in self.states
+            for o in self.beside.states
+            if s.indentation == o.indentation and s.indentation != self.states[0].indentation
+        ]
+        if pairs:
+            s, o = min(pairs, key=lambda pair: abs(pair[0].indentation - other.indentation))
+            scale = (other.indentation - self.states[0].indentation) / (
+                s.indentation - self.states[0].indentation
+            )
+            difference = scale * (s.moved - o.moved)
+        elif other.closed.all() and self.states[0].closed.all():
+            rates = [p.rate() for p in (self, self.beside)]
+            difference = (rates[0] - rates[1]) * other.indentation
+        else:
+            difference = np.zeros_like(other.moved)
+        return replace(other, moved=other.moved + difference)
+
+    def rate(self) -> Floats:
+        """Displacements per mm of a linear press with all pairs closed, (nodes, 3) mm / mm."""
+        if self._rate is None:
+            model = self.states[0].model
+            sys = model.system(np.ones(model.nodes.tip.shape, dtype=bool))
+            held = model.chest(1.0)
+            load = -sys.gather(model.nodal(product(self.body.rest, held, model)))
+            factor = self.body.factor(sys, self.body.rest)
+            self._rate = sys.expand(factor.factor.solve(load, matrices=self.body.rest)) + held
+        return self._rate
+
+
+def path(geometry: Geometry, model: Model, inclusion: bool, beside: Path | None = None) -> Path:
+    """Start at first touch. `beside`: the path without inclusion, whose factor is shared."""
+    shear, bulk = moduli(geometry, model, inclusion)
+    if beside is None:
+        kind = np.float32 if model.finite or model.quad.size > _MANY else np.float64
+        rest = Stiffness(elasticity.stiffness(model.quad, shear, bulk, dtype=kind))
+    else:
+        ball = elasticity.stiffness(model.quad, shear[model.ball], bulk[model.ball], elements=model.ball)
+        rest = replace(beside.body.rest, other=model.ball, instead=ball)
+    body = Body(shear, bulk, rest, model.finite, inclusion, {} if beside is None else beside.body.factors)
+    still = np.zeros_like(model.place)
+    bond = level(model.interface)
+    clearance = bond.gap(model.place)
+    flat = bool(np.abs(clearance).max() < 1e-9)
+    start = 0.0 if flat else float(clearance.min() / model.normal[2])
+    closed = np.full(clearance.shape, flat)
+    apart = still - start * model.normal * model.slab
+    nothing = State(start, apart, closed, np.zeros(closed.shape), np.zeros(3), model, bond)
+    return Path(geometry, body, [nothing], beside)
