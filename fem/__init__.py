@@ -12,6 +12,7 @@ from fem.model import Inclusion, Layer, NotConverged, NotModelled, Pose, Probe, 
 from fem.scalars import scalars
 
 if TYPE_CHECKING:
+    from fem.ccx import deck
     from fem.plane import Press2D, press_2d
     from fem.plane_scalars import scalars_2d
     from fem.pressing import Press, press, press_moduli
@@ -27,6 +28,7 @@ __all__ = [
     "Press2D",
     "Probe",
     "Slab",
+    "deck",
     "press",
     "press_2d",
     "press_moduli",
@@ -37,6 +39,7 @@ __all__ = [
 ]
 
 _LATER = {
+    "deck": "ccx",
     "Press": "pressing",
     "press": "pressing",
     "press_moduli": "pressing",
