@@ -32,18 +32,14 @@ _FORCING = 1e-3  # to which conjugate gradients solve each Newton step
 _HALVINGS = 8  # of a Newton step at most
 _NEWTON = 20  # steps at most
 _PATIENCE = 12  # steps after which the residual must have come down to a hundredth of the reaction
-_DAMPING, _STRONGEST = 0.05, 3.0
+_DAMPING, _STRONGEST = 0.05, 0.8  # share of the stiffness at rest added where the tangent is not definite
 _WORTH = 15  # iterations of conjugate gradients that are worth a new factor
 _CHUNK = 128  # element matrices made double at a time
-import os
-_MIX=float(os.environ.get('MIX','0.6'))
-_MEMORY=int(os.environ.get('MEM','5'))
-_TURNS = 12  # of slab's mesh and slopes at most
+_TURNS = 12  # of the slab's mesh and the slopes at most
+_MEMORY = 5  # turns that the next one is extrapolated from
 _SLIP, _RIM_SLIP = 2e-4, 2e-3  # mm by which the mesh may still want to move: inside, and at the probe's edge
 _OFF = 1e-3  # share of the largest force by which forces inside may still change
-_TALK=False
-_LOOSE = 3e-4  # tolerance while the tie still changes
-_TURN = 1e-3  # change of the contact's slope that is left, in shares of the largest force
+_LOOSE = 3e-4  # tolerance while mesh and slopes still change
 _SETS = 40  # changes of the active set at most
 
 
@@ -229,9 +225,9 @@ def equilibrium(body: Body, guess: State) -> State:
             settled = (
                 float(wanted[inner].max()) <= _SLIP
                 and float(wanted.max()) <= _RIM_SLIP
-                and float(np.abs(state.force - before)[inner].max()) <= _OFF * float(np.abs(state.force).max())
+                and float(np.abs(state.force - before)[inner].max())
+                <= _OFF * float(np.abs(state.force).max())
             )
-            if _TALK: print('      turn', turns, 'slip', np.abs(wanted).max(), np.unravel_index(np.abs(wanted).argmax(),wanted.shape), state.tie.slope[-1,-3:,0], np.unravel_index(np.abs(state.force - before).argmax(), before.shape), 'wslip', wanted[inner].max(), 'off', np.abs(state.force - before)[inner].max()/np.abs(state.force).max())
             if turns > _TURNS and not settled:
                 raise NotConverged("the sliding contact does not settle")
             continue
@@ -254,8 +250,8 @@ def equilibrium(body: Body, guess: State) -> State:
 def _realign(state: State, known: list[tuple[Floats, Floats]]) -> State:
     """Move the slab's mesh to where the probe's nodes stand now, and take their slopes.
 
-    The turns are accelerated (Anderson 1965; [anderson1965]): near 4 mm, where the pressure is no longer small
-    against the tissue's modulus, plain ones would drift off to both sides of the answer.
+    The turns are accelerated (Anderson 1965; [anderson1965]): from 4 mm on, where the pressure is no longer
+    small against the tissue's modulus, plain ones would drift off to both sides of the answer.
     """
     model, place = state.model, state.model.place + state.moved
     slope = model.interface.slope(place)
@@ -266,11 +262,11 @@ def _realign(state: State, known: list[tuple[Floats, Floats]]) -> State:
     asked = np.concatenate([model.wanted(state.moved), slope]).ravel() - now
     known.append((now, asked))
     recent = [k for k in known if len(k[0])][-_MEMORY:]
-    answer = now + _MIX * asked
+    answer = now + asked
     if len(recent) > 1:
         x, f = (np.stack(part, axis=1) for part in zip(*recent, strict=True))
         dx, df = np.diff(x, axis=1), np.diff(f, axis=1)
-        answer -= (dx + _MIX * df) @ np.linalg.lstsq(df, asked, rcond=1e-8)[0]
+        answer -= (dx + df) @ np.linalg.lstsq(df, asked, rcond=1e-8)[0]
     shift, slope = answer.reshape(2, *slope.shape)
     return replace(state, model=model.follow(shift), tie=replace(state.tie, slope=slope))
 
@@ -303,7 +299,6 @@ def _newton(body: Body, start: State, tolerance: float) -> State:
                 if not model.finite or damping >= _STRONGEST:
                     raise
                 damping, renew = max(4 * damping, _DAMPING), True
-                if _TALK: print('      damp', damping, turn, size/scale)
         renew = model.finite and (steps > _WORTH or damping > 0)
         damping = damping / 4 if damping > _DAMPING else 0.0
         body.effort.newton += 1

@@ -24,8 +24,8 @@ Floats = NDArray[np.float64]
 # sphere and cells along its arc matter most.
 QUALITIES = {
     "preview": Resolution(arc=3, core=1, shell=3, above=2, below=1, edge=2, side=2, layer=1, backing=1),
-    "standard": Resolution(arc=4, core=1, shell=4, above=3, below=2, edge=3, side=4, layer=3, backing=1),
-    "reference": Resolution(arc=5, core=2, shell=5, above=3, below=3, edge=4, side=4, layer=3, backing=2),
+    "standard": Resolution(arc=4, core=1, shell=4, above=3, below=2, edge=2, side=4, layer=2, backing=1),
+    "reference": Resolution(arc=5, core=2, shell=5, above=3, below=3, edge=3, side=4, layer=3, backing=2),
 }
 
 
@@ -62,13 +62,14 @@ class Span:
     side_high: float
 
     def lines(self, logical: Floats, res: Resolution) -> Floats:
-        """Real coordinate of logical ones: even in the box, finer towards the probe's edge from both
-        sides."""
+        """Real coordinate of logical ones: even in the box; coarser towards the probe's edge, whose singular
+        corners would tear finer cells apart at finite strain and whose resolution the signal does not feel
+        (0.1 %); beyond it coarser outwards."""
         knots = np.concatenate([[0.0], res.reach + np.arange(res.edge + res.side + 1.0)])
 
         def half(box: float, edge: float, side: float) -> Floats:
-            inner = edge - (edge - box) * graded(res.edge, 1.7)[::-1]
-            outer = edge + (side - edge) * graded(res.side, 2.2) if res.side else np.array([edge])
+            inner = box + (edge - box) * graded(res.edge, 2.0)
+            outer = edge + (side - edge) * graded(res.side, 1.6) if res.side else np.array([edge])
             return np.concatenate([[self.middle], inner, outer[1:]])
 
         above = np.interp(logical, knots, half(self.high, self.edge_high, self.side_high))

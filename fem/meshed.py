@@ -90,7 +90,9 @@ class Model:
         quad, place, cut = quadrature(slab), self.place.copy(), self.nodes.slab_cells
         place[: self.nodes.slab] = slab.doflocs.T
         probe = self.quad.part(np.arange(cut, self.quad.size))
-        fields = (np.concatenate([getattr(quad, f), getattr(probe, f)]) for f in ("inverse", "weight", "modes"))
+        fields = (
+            np.concatenate([getattr(quad, f), getattr(probe, f)]) for f in ("inverse", "weight", "modes")
+        )
         return replace(self, quad=Quadrature(self.quad.nodes, *fields), place=place, shift=shift)
 
 

@@ -158,7 +158,11 @@ class Path:
         else:
             difference, slip = np.zeros_like(other.moved), np.zeros_like(other.model.shift)
         guess = replace(other, moved=other.moved + difference)
-        return replace(guess, model=other.model.follow(other.model.shift + slip)) if other.model.finite else guess
+        return (
+            replace(guess, model=other.model.follow(other.model.shift + slip))
+            if other.model.finite
+            else guess
+        )
 
     def rate(self) -> Floats:
         """Displacements per mm of a linear press with all pairs closed, (nodes, 3) mm / mm."""

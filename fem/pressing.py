@@ -15,8 +15,8 @@ from fem import mesh, surface, volume
 from fem.equilibrium import NotConverged as Stuck
 from fem.equilibrium import State
 from fem.mesh import Geometry
-from fem.model import Inclusion, NotConverged, NotModelled, Pose, Probe, Slab, check
 from fem.meshed import build, moduli
+from fem.model import Inclusion, NotConverged, NotModelled, Pose, Probe, Slab, check
 from fem.path import path
 from fem.solver import one_thread
 from fem.topology import Resolution, materials, probe_topology, slab_topology
