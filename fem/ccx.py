@@ -28,8 +28,8 @@ from skfem import ElementHex2
 
 from fem import mesh
 from fem.mesh import Geometry
+from fem.meshed import build
 from fem.model import Inclusion, Pose, Probe, Slab, check
-from fem.path import build
 from fem.topology import Resolution, materials, probe_topology
 
 Floats = NDArray[np.float64]

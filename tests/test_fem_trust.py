@@ -8,7 +8,8 @@ from test_fem_convergence import REFINED
 
 import fem
 from fem.mesh import QUALITIES, Geometry
-from fem.path import Path, build, path
+from fem.meshed import build
+from fem.path import Path, path
 from fem.topology import Resolution
 from fem.trust import discretisation_error, tared
 
