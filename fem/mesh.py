@@ -24,7 +24,7 @@ Floats = NDArray[np.float64]
 # sphere and cells along its arc matter most.
 QUALITIES = {
     "preview": Resolution(arc=3, core=1, shell=3, above=2, below=1, edge=2, side=2, layer=1, backing=1),
-    "standard": Resolution(arc=4, core=1, shell=4, above=3, below=2, edge=2, side=4, layer=2, backing=1),
+    "standard": Resolution(arc=4, core=1, shell=4, above=3, below=2, edge=2, side=4, layer=3, backing=1),
     "reference": Resolution(arc=5, core=2, shell=5, above=3, below=3, edge=3, side=4, layer=3, backing=2),
 }
 
