@@ -68,8 +68,8 @@ class Span:
         knots = np.concatenate([[0.0], res.reach + np.arange(res.edge + res.side + 1.0)])
 
         def half(box: float, edge: float, side: float) -> Floats:
-            inner = box + (edge - box) * graded(res.edge, 2.0)
-            outer = edge + (side - edge) * graded(res.side, 1.6) if res.side else np.array([edge])
+            inner = box + (edge - box) * graded(res.edge, res.growth[0])
+            outer = edge + (side - edge) * graded(res.side, res.growth[1]) if res.side else np.array([edge])
             return np.concatenate([[self.middle], inner, outer[1:]])
 
         above = np.interp(logical, knots, half(self.high, self.edge_high, self.side_high))
