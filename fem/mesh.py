@@ -23,7 +23,9 @@ Floats = NDArray[np.float64]
 # (10, 5, 100), (4, 6, 60), (13, 4, 120): preview 2 %, standard 0.5 %, reference 0.2 %. Shells outside the
 # sphere and cells along its arc matter most.
 QUALITIES = {
-    "preview": Resolution(arc=3, core=1, shell=3, above=2, below=1, edge=2, side=2, layer=1, backing=1),
+    "preview": Resolution(
+        arc=3, core=1, shell=3, above=2, below=1, edge=2, side=2, layer=1, backing=1, growth=(2.0, 1.6)
+    ),
     "standard": Resolution(arc=4, core=1, shell=4, above=3, below=2, edge=2, side=4, layer=3, backing=1),
     "reference": Resolution(arc=5, core=2, shell=5, above=3, below=3, edge=3, side=4, layer=3, backing=2),
 }
@@ -62,7 +64,7 @@ class Span:
     side_high: float
 
     def lines(self, logical: Floats, res: Resolution) -> Floats:
-        """Real coordinate of logical ones: even in the box; coarser towards the probe's edge, whose singular
+        """Real coordinate of logical ones: even in the box and on to the probe's edge, whose singular
         corners would tear finer cells apart at finite strain and whose resolution the signal does not feel
         (0.1 %); beyond it coarser outwards."""
         knots = np.concatenate([[0.0], res.reach + np.arange(res.edge + res.side + 1.0)])

@@ -32,7 +32,7 @@ class Resolution:
     side: int  # between the probe's edge and the slab's side
     layer: int  # through the probe's contact layer
     backing: int  # through each of its other layers
-    growth: tuple[float, float] = (2.0, 1.6)  # of cells from the box to the probe's edge, and beyond it
+    growth: tuple[float, float] = (1.0, 1.6)  # of cells from the box to the probe's edge, and beyond it
 
     @property
     def rim(self) -> int:
