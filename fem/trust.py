@@ -19,10 +19,10 @@ from fem.topology import Resolution
 Floats = NDArray[np.float64]
 
 COARSER = {
-    # fewer cells only where preview's own errors are: along the inclusion, and out to the probe's edge.
-    # Thinning the shells and layers over deep inclusions as well tells nothing of them: ten times the error.
+    # fewer cells where preview's own errors are: along the inclusion, and to both sides of the probe's edge.
+    # Thinner layers over deep inclusions would tell nothing of them: ten times the error.
     QUALITIES["preview"]: Resolution(
-        arc=2, core=1, shell=3, above=2, below=1, edge=1, side=2, layer=1, backing=1
+        arc=2, core=1, shell=3, above=2, below=1, edge=1, side=1, layer=1, backing=1
     ),
     QUALITIES["standard"]: QUALITIES["preview"],
     QUALITIES["reference"]: QUALITIES["standard"],

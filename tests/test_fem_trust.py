@@ -15,7 +15,7 @@ from fem.trust import discretisation_error, tared
 
 PROBE = fem.Probe(25, (fem.Layer(2, 27), fem.Layer(3, 61), fem.Layer(5, 156)))
 SLAB = fem.Slab(30, 60, 5)
-CASES = [(10, 5), (4, 6), (13, 4), (6, 8), (8, 3), (5, 10)]  # size, depth, mm
+CASES = [(10, 5), (4, 6), (13, 4), (6, 8), (8, 3), (5, 10), (12, 8), (9, 12)]  # size, depth, mm
 
 
 def pair(geometry: Geometry, res: Resolution) -> tuple[Path, Path]:
