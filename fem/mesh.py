@@ -19,9 +19,10 @@ from fem.topology import Layout, Resolution, probe_topology, slab_topology
 
 Floats = NDArray[np.float64]
 
-# Largest error of tared maximum and total against 145 thousand unknowns, for (size, depth, modulus) =
-# (10, 5, 100), (4, 6, 60), (13, 4, 120): preview 2 %, standard 0.5 %, reference 0.2 %. Shells outside the
-# sphere and cells along its arc matter most.
+# Largest error of tared maximum and total against 145 thousand unknowns, over (size, depth, modulus) =
+# (10, 5, 100), (4, 6, 60), (13, 4, 120), (8, 5, 60), 1 mm of small strain: preview 2.1 %, standard 0.5 %,
+# reference 0.2 % (`make bench` prints the table). Shells outside the sphere and cells along its arc matter
+# most for these; cells towards the probe's edge for the displacement there.
 QUALITIES = {
     "preview": Resolution(
         arc=3, core=1, shell=3, above=2, below=1, edge=2, side=2, layer=1, backing=1, growth=(2.0, 1.6)

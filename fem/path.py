@@ -17,7 +17,6 @@ from fem.meshed import Model, moduli
 Floats = NDArray[np.float64]
 
 _LONGEST = 1.0  # mm of indentation in one step
-_MANY = 4500  # elements from which on their stiffness is kept in single precision
 _SECANT, _FORCE = 25, 1e-9  # steps to find a force, and how well to meet it
 _CUTS = 9  # halvings of a step at most
 
@@ -180,7 +179,9 @@ def path(geometry: Geometry, model: Model, inclusion: bool, beside: Path | None 
     """Start at first touch. `beside`: the path without inclusion, whose factor is shared."""
     shear, bulk = moduli(geometry, model, inclusion)
     if beside is None:
-        kind = np.float32 if model.finite or model.quad.size > _MANY else np.float64
+        # linear forces come from these matrices: single precision, amplified by the bulk modulus, would cost
+        # the balance of forces 1e-4 and more. Finite strain takes its forces from the energy.
+        kind = np.float32 if model.finite else np.float64
         rest = Stiffness(elasticity.stiffness(model.quad, shear, bulk, dtype=kind))
     else:
         ball = elasticity.stiffness(model.quad, shear[model.ball], bulk[model.ball], elements=model.ball)
