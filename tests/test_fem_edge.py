@@ -55,7 +55,7 @@ def test_both_ends_mirror() -> None:
 def test_pressure_rises_towards_the_edge_without_ringing() -> None:
     layers = (fem.Layer(2, 27), fem.Layer(3, 61), fem.Layer(5, 156))
     answer = fem.press(
-        fem.Probe(25, layers), fem.Slab(30, 60, 5), None, 1.0, mechanics="linear", quality="preview"
+        fem.Probe(25, layers), fem.Slab(30, 60, 5), None, 1.0, mechanics="linear", quality="standard"
     )
     x, y = answer.surface.points[:, 0], answer.surface.points[:, 1]
     row = (np.abs(y) < 1e-9) & (x > 5)
