@@ -153,11 +153,17 @@ def test_linear_at_equal_error(ladders: dict[str, list[Run]], expected: float) -
     ours, bound = time_at(ladders["ours"], expected)
     assert not bound
     print(f"\nlinear press at {ERROR_PERCENT:g} % error: ours {ours:.2f} s; {draw(ladders, expected).name}")
+    ratios = {}
     for name, runs in ladders.items():
+        if name == "ours":
+            continue
         theirs, bound = time_at(runs, expected)
-        if name != "ours":
-            word = "more than (lower bound) " if bound else ""
-            print(f"  {name}: {word}{theirs:.1f} s, ratio {word}{theirs / ours:.0f} (goal {PEER_GOAL:.0f})")
+        ratios[name] = theirs / ours
+        word = ", a lower bound: no mesh reached it" if bound else ""
+        print(f"  {name}: {theirs:.1f} s, ratio {theirs / ours:.1f} (goal {PEER_GOAL:.0f}){word}")
+    # Beside CalculiX the goal is missed, and not asserted: its brick with reduced integration is about as
+    # accurate and as quick as ours.
+    assert all(ratio >= PEER_GOAL for name, ratio in ratios.items() if name != "CalculiX")
 
 
 @pytest.mark.slow
@@ -173,11 +179,12 @@ def test_batch_over_moduli(ladders: dict[str, list[Run]], expected: float) -> No
                 PROBE, SLAB, BALL, moduli, LEVEL_MM, mechanics="linear", quality=quality, estimate=False
             )
             each = (time.perf_counter() - start) / len(moduli)
-            word = "more than (lower bound) " if bound else ""
+            word = ", a lower bound: no mesh of P2 reached it" if bound else ""
             print(
-                f"\n16 moduli, {quality}: {each:.3f} s each, P2 alone {word}{theirs:.1f} s, "
-                f"ratio {word}{theirs / each:.0f} (goal {BATCH_GOAL:.0f})"
+                f"\n16 moduli, {quality}: {each:.3f} s each; one press of P2 at {ERROR_PERCENT:g} % error "
+                f"{theirs:.1f} s, ratio {theirs / each:.0f} (goal {BATCH_GOAL:.0f}){word}"
             )
+            assert theirs / each >= BATCH_GOAL
 
 
 @pytest.mark.slow
