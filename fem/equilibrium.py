@@ -36,9 +36,10 @@ _DAMPING, _STRONGEST = 0.05, 0.8  # share of the stiffness at rest added where t
 _WORTH = 15  # iterations of conjugate gradients that are worth a new factor
 _CHUNK = 128  # element matrices made double at a time
 _TURNS = 12  # of the slab's mesh and the slopes at most
+_STRICT = 8  # turns after which the probe's edge may still want to move by more
 _MEMORY = 5  # turns that the next one is extrapolated from
 _SLIP, _RIM_SLIP = 2e-4, 2e-3  # mm by which the mesh may still want to move: inside, and at the probe's edge
-_OFF = 1e-3  # share of the largest force by which forces inside may still change
+_OFF = 1e-4  # share of the largest force by which forces may still change
 _LOOSE = 3e-4  # tolerance while mesh and slopes still change
 _SETS = 40  # changes of the active set at most
 
@@ -222,11 +223,13 @@ def equilibrium(body: Body, guess: State) -> State:
                 return state
             wanted = np.abs(state.model.wanted(state.moved) - state.model.shift)
             inner = state.model.interface.inner
-            settled = (
-                float(wanted[inner].max()) <= _SLIP
-                and float(wanted.max()) <= _RIM_SLIP
-                and float(np.abs(state.force - before)[inner].max())
-                <= _OFF * float(np.abs(state.force).max())
+            change = np.abs(state.force - before) / float(np.abs(state.force).max())
+            rim = (_SLIP, _OFF) if turns <= _STRICT else (_RIM_SLIP, np.inf)
+            settled = bool(
+                wanted[inner].max() <= _SLIP
+                and change[inner].max() <= _OFF
+                and wanted.max() <= rim[0]
+                and change.max() <= rim[1]
             )
             if turns > _TURNS and not settled:
                 raise NotConverged("the sliding contact does not settle")

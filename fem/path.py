@@ -17,7 +17,7 @@ from fem.meshed import Model, moduli
 Floats = NDArray[np.float64]
 
 _LONGEST = 1.0  # mm of indentation in one step
-_SECANT, _FORCE = 25, 1e-9  # steps to find a force, and how well to meet it
+_SECANT, _FORCE = 25, 1e-6  # steps to find a force, and how well to meet it
 _CUTS = 9  # halvings of a step at most
 
 

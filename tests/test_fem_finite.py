@@ -130,15 +130,13 @@ def test_a_press_balances(levels: list[fem.Press]) -> None:
         assert answer.mechanics == "finite"
 
 
-@pytest.mark.slow
 def test_levels_on_the_way_are_single_presses(levels: list[fem.Press]) -> None:
     alone = fem.press(PROBE, SLAB, BALL, 2.0, quality="preview", estimate=False)
     assert np.abs(tared(levels[1]) - tared(alone)).max() < 1e-4 * np.abs(tared(alone)).max()
 
 
-@pytest.mark.slow
 def test_press_by_force() -> None:
     answer = fem.press(PROBE, SLAB, BALL, force=0.5, quality="preview", estimate=False)
-    assert answer.force_N == pytest.approx(0.5, rel=1e-8)
-    assert answer.force_0_N == pytest.approx(0.5, rel=1e-8)
+    assert answer.force_N == pytest.approx(0.5, rel=2e-6)
+    assert answer.force_0_N == pytest.approx(0.5, rel=2e-6)
     assert answer.indentation_mm < answer.indentation_0_mm
