@@ -5,6 +5,7 @@ The tangent is applied element by element and never assembled; a Cholesky factor
 (`fem.solver`) preconditions it, so that most Newton steps need no factorisation at all. Which pairs of
 contact nodes are closed is iterated around it (primal-dual active set: Hüeber and Wohlmuth 2005;
 [hueber2005]): closed pairs that pull are opened, open pairs that overlap are closed, until neither is left.
+At finite strain the slab's mesh and the contact's slopes are iterated with it until they stay (`fem.contact`).
 """
 
 from __future__ import annotations
@@ -223,7 +224,7 @@ def equilibrium(body: Body, guess: State) -> State:
                 return state
             wanted = np.abs(state.model.wanted(state.moved) - state.model.shift)
             inner = state.model.interface.inner
-            change = np.abs(state.force - before) / float(np.abs(state.force).max())
+            change = np.abs(state.force - before) / max(float(np.abs(state.force).max()), 1e-300)
             rim = (_SLIP, _OFF) if turns <= _STRICT else (_RIM_SLIP, np.inf)
             settled = bool(
                 wanted[inner].max() <= _SLIP
@@ -258,16 +259,14 @@ def _realign(state: State, known: list[tuple[Floats, Floats]]) -> State:
     """
     model, place = state.model, state.model.place + state.moved
     slope = model.interface.slope(place)
-    if not known and not state.tie.slope.any():
-        known.append((np.zeros(0), np.zeros(0)))
+    if not state.tie.slope.any():  # the first of all
         return replace(state, tie=replace(state.tie, slope=slope))
     now = np.concatenate([model.shift, state.tie.slope]).ravel()
     asked = np.concatenate([model.wanted(state.moved), slope]).ravel() - now
     known.append((now, asked))
-    recent = [k for k in known if len(k[0])][-_MEMORY:]
     answer = now + asked
-    if len(recent) > 1:
-        x, f = (np.stack(part, axis=1) for part in zip(*recent, strict=True))
+    if len(known) > 1:
+        x, f = (np.stack(part, axis=1) for part in zip(*known[-_MEMORY:], strict=True))
         dx, df = np.diff(x, axis=1), np.diff(f, axis=1)
         answer -= (dx + df) @ np.linalg.lstsq(df, asked, rcond=1e-8)[0]
     shift, slope = answer.reshape(2, *slope.shape)
@@ -275,7 +274,7 @@ def _realign(state: State, known: list[tuple[Floats, Floats]]) -> State:
 
 
 def _newton(body: Body, start: State, tolerance: float) -> State:
-    """Equilibrium for a given set of closed pairs and slopes."""
+    """Equilibrium for a given set of closed pairs, mesh and slopes."""
     model, closed, moved, bond = start.model, start.closed, start.moved, start.tie
     sys = model.system(closed)
     tip, at_chest = model.nodes.tip, model.nodes.chest
