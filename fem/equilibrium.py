@@ -5,7 +5,7 @@ The tangent is applied element by element and never assembled; a Cholesky factor
 (`fem.solver`) preconditions it, so that most Newton steps need no factorisation at all. Which pairs of
 contact nodes are closed is iterated around it (primal-dual active set: Hüeber and Wohlmuth 2005;
 [hueber2005]): closed pairs that pull are opened, open pairs that overlap are closed, until neither is left.
-At finite strain the slab's mesh and the contact's slopes are iterated with it until they stay (`fem.contact`).
+At finite strain the slab's mesh and the contact's slopes are iterated with it (`fem.contact`).
 """
 
 from __future__ import annotations
