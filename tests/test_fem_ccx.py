@@ -96,7 +96,7 @@ def test_linear(tmp_path: Path, inclusion: fem.Inclusion) -> None:
         3.0,
         pytest.param(
             6.0,
-            marks=pytest.mark.xfail(reason="the probe's soft corners fold before 6 mm, here and in CalculiX"),
+            marks=pytest.mark.xfail(reason="the soft corners fold before 6 mm, here and in CalculiX"),
         ),
     ],
 )
