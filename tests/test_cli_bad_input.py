@@ -286,7 +286,7 @@ def twin(*arguments, folder):
         ([*FINE, "--force", "9", "--quality", "preview"], ["--force", "9.0", "<= about"]),
         (
             [*FINE, "--force", "2", "--quality", "preview", "--mechanics", "linear"],
-            ["--force", "2.0", "<= about 1.65 N", "6 mm deep"],
+            ["--force", "2.0", "<= about 1.66 N", "6 mm deep"],
         ),
         ([*EXPORT, "--vtu", "."], ["--vtu", "'.'", ".vtu"]),
     ],
