@@ -82,7 +82,7 @@ def test_linear_at_a_glance(tmp_path: Path) -> None:
 @pytest.mark.parametrize("inclusion", INCLUSIONS, ids=str)
 def test_linear(tmp_path: Path, inclusion: fem.Inclusion) -> None:
     geometry = Geometry(PROBE, SLAB, inclusion)
-    ((top, total, force),) = compared(tmp_path, geometry, [1.0], "linear", "reference", "reference")
+    ((top, total, force),) = compared(tmp_path, geometry, [1.0], "linear", "standard", FINE_EDGE)
     assert abs(top) < 5e-3 and abs(total) < 5e-3 and abs(force) < 5e-3
 
 
@@ -96,15 +96,18 @@ def test_linear(tmp_path: Path, inclusion: fem.Inclusion) -> None:
         3.0,
         pytest.param(
             6.0,
-            marks=pytest.mark.xfail(reason="the soft corners fold before 6 mm, here and in CalculiX"),
+            marks=pytest.mark.xfail(
+                raises=fem.NotConverged, strict=True, reason="the probe's soft corners fold before 6 mm"
+            ),
         ),
     ],
 )
 @pytest.mark.parametrize("inclusion", INCLUSIONS, ids=str)
 def test_finite(tmp_path: Path, inclusion: fem.Inclusion, level: float) -> None:
+    """Totals are printed, not held: from 3 mm on they contain CalculiX's folded corners."""
     geometry = Geometry(PROBE, SLAB, inclusion)
-    ((top, _, _),) = compared(tmp_path, geometry, [level], "finite", "standard", COARSE_EDGE)
-    assert abs(top) < 0.02
+    ((top, _, force),) = compared(tmp_path, geometry, [level], "finite", "standard", COARSE_EDGE)
+    assert abs(top) < 0.02 and abs(force) < 0.02
 
 
 @needs_ccx
@@ -117,8 +120,8 @@ def test_finite(tmp_path: Path, inclusion: fem.Inclusion, level: float) -> None:
 )
 def test_finite_where_contact_spreads(tmp_path: Path, probe: fem.Probe, tilt: tuple[float, float]) -> None:
     geometry = Geometry(probe, SLAB, INCLUSIONS[0], Pose(tilt))
-    for top, _, _ in compared(tmp_path, geometry, [1.0, 2.0], "finite", "standard", COARSE_EDGE):
-        assert abs(top) < 0.03
+    for differences in compared(tmp_path, geometry, [1.0, 2.0], "finite", "standard", COARSE_EDGE):
+        assert max(map(abs, differences)) < 0.03
 
 
 @pytest.mark.parametrize(
