@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from .bsdf import Table
 from .build import radiance
-from .irradiance import AngularBasis, land
+from .irradiance import look_up
 from .sensor import Sensor
 from .view import PixelRays, faces_reflectance
 
@@ -31,15 +31,15 @@ class Sight:
     ----------
     position_mm : (rows, columns, 2)
         Point of the deformed surface that each pixel sees directly.
-    points : list of (x, y, fraction, gain)
-        For each sight, on the device: position in units of the guide's width (0..1), real contact fraction,
-        and radiance at the camera per transmitted irradiance, 1/sr.
+    points : list of (x, y, gain)
+        For each sight, on the device: position in units of the guide's width (0..1), and radiance at the
+        camera per flux that goes up in the tissue, 1/sr.
     lamps : (n_led, rows, columns)
         Radiance at the camera, W mm⁻² sr⁻¹, of LEDs in sight: embedded ones, straight or mirrored.
     """
 
     position_mm: NDArray[np.float32]
-    points: list[tuple[mi.Float, mi.Float, mi.Float, mi.Float]]
+    points: list[tuple[mi.Float, mi.Float, mi.Float]]
     lamps: NDArray[np.float32]
 
 
@@ -54,6 +54,7 @@ def look(scene: mi.Scene, sensor: Sensor, table: Table, rays: PixelRays) -> Sigh
     contact = next(shape for shape in scene.shapes() if shape.id() == "contact")
 
     named = {shape.id(): mi.ShapePtr(shape) for shape in scene.shapes()}
+    squeezed = (guide.refractive_index / sensor.tissue.refractive_index) ** 2  # tissue's radiance in the guide
     lamps = [mi.Float(0.0) for _ in sensor.leds]
     points = []
     start = mi.Point3f(*origin) + _STEP_MM / direction.z * direction
@@ -64,8 +65,8 @@ def look(scene: mi.Scene, sensor: Sensor, table: Table, rays: PixelRays) -> Sigh
         cosine = mi.Frame3f.cos_theta(si.wi)
         fraction = dr.select(seen, contact.eval_attribute_1("vertex_contact_fraction", si, seen), 0.0)
         transmitted = table.transmittance(fraction, cosine, seen)
-        emitted = dr.select(seen, gain * transmitted * table.diffuse_gain(fraction, seen) * dr.inv_pi, 0.0)
-        points.append((si.p.x / guide.width_mm + 0.5, si.p.y / guide.width_mm + 0.5, fraction, emitted))
+        emitted = dr.select(seen, gain * transmitted * squeezed * dr.inv_pi, 0.0)
+        points.append((si.p.x / guide.width_mm + 0.5, si.p.y / guide.width_mm + 0.5, emitted))
         # mirrored in the contact surface, down, mirrored in the lower faces, up again; the slope left out
         gain = dr.select(seen, gain * (1.0 - transmitted), 0.0)
         down = mi.Vector3f(direction.x, direction.y, -direction.z)
@@ -109,16 +110,16 @@ def _add_lamps(
         lamps[number] += dr.select(meets, gain * radiance(led), 0.0)
 
 
-def picture(sight: Sight, basis: AngularBasis, irradiance: NDArray[np.float64]) -> NDArray[np.float32]:
+def picture(sight: Sight, upward: NDArray[np.float64]) -> NDArray[np.float32]:
     """Radiance in air at the pixels, (n_led, rows, columns), in W m⁻² sr⁻¹.
 
-    `irradiance` (n_led, count, m, m), W/mm², smoothed, on cells [iy, ix] of the guide's face.
+    `upward` (n_led, m, m), W/mm², is the flux that goes up in the tissue, on cells [iy, ix] of the guide's
+    face.
     """
-    n_led = irradiance.shape[0]
+    n_led = upward.shape[0]
     total = [mi.Float(0.0) for _ in range(n_led)]
-    for x, y, fraction, gain in sight.points:
-        landed = land(basis, irradiance, x, y, fraction)
-        total = [sum_ + gain * part for sum_, part in zip(total, landed, strict=True)]
+    for x, y, gain in sight.points:
+        total = [sum_ + gain * part for sum_, part in zip(total, look_up(upward, x, y), strict=True)]
     dr.eval(total)
     shape = (n_led, *sight.position_mm.shape[:2])
     layers = np.stack([np.asarray(layer) for layer in total]).reshape(shape)

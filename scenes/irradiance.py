@@ -58,30 +58,25 @@ def weigh(weights: mi.Float, count: int, n_cos: int, cosine: mi.Float, active: m
     return [dr.lerp(a, b, share) for a, b in zip(low, high, strict=True)]
 
 
-def land(
-    basis: AngularBasis, irradiance: Array, x: mi.Float, y: mi.Float, fraction: mi.Float
-) -> list[mi.Float]:
-    """Irradiance that enters the tissue, W/mm², from each LED at points with a real contact fraction.
+def look_up(maps: Array, x: mi.Float, y: mi.Float) -> list[mi.Float]:
+    """Values of maps (n, m, m), on cells [iy, ix] of the guide's face, at x and y in units of its width."""
+    layers = np.ascontiguousarray(np.moveaxis(maps, 0, -1), dtype=np.float32)
+    return list(mi.Texture2f(mi.TensorXf(layers), wrap_mode=dr.WrapMode.Clamp).eval(mi.Point2f(x, y)))
 
-    `irradiance` (n_led, count, m, m) on cells [iy, ix] of the guide's face; x and y in units of its width.
-    """
-    n_led, count = irradiance.shape[:2]
-    maps = np.moveaxis(irradiance.reshape(n_led * count, *irradiance.shape[2:]), 0, -1)
-    texture = mi.Texture2f(
-        mi.TensorXf(np.ascontiguousarray(maps, dtype=np.float32)), wrap_mode=dr.WrapMode.Clamp
-    )
-    rows = mi.Float(np.ascontiguousarray(basis.rows, dtype=np.float32).ravel())
-    last = basis.rows.shape[0] - 1
-    node = dr.minimum(mi.UInt32(fraction * last), last - 1)
-    share = fraction * last - mi.Float(node)
-    values = texture.eval(mi.Point2f(x, y))
-    total = [mi.Float(0.0) for _ in range(n_led)]
-    for k in range(count):
-        low, high = (dr.gather(mi.Float, rows, (node + i) * count + k) for i in (0, 1))
-        weight = dr.lerp(low, high, share)
-        for led in range(n_led):
-            total[led] += weight * values[led * count + k]
-    return total
+
+def transmitted(basis: AngularBasis, irradiance: Array, fraction: Array) -> Array:
+    """Irradiance that enters the tissue, (n, m, m) W/mm², of (n, count, m, m) where the real contact fraction
+    is (m, m)."""
+    return np.einsum("yxk,nkyx->nyx", by_fraction(basis.rows, fraction), irradiance)
+
+
+def by_fraction(rows: Array, fraction: Array) -> Array:
+    """Rows (n_fraction, ...) of a table, uniform on 0..1, at fractions (m, m): (m, m, ...), linear between."""
+    last = len(rows) - 1
+    at = np.clip(fraction, 0.0, 1.0) * last
+    node = np.minimum(at.astype(np.int64), last - 1)
+    share = (at - node).reshape(*fraction.shape, *(1,) * (rows.ndim - 1))
+    return np.asarray(rows[node] * (1.0 - share) + rows[node + 1] * share)
 
 
 def smooth(irradiance: Array, factor: int = 4) -> Array:
@@ -91,11 +86,6 @@ def smooth(irradiance: Array, factor: int = 4) -> Array:
     at the rim, where the surface bends and light changes from cell to cell: those cells keep their values.
     """
     return _along_both(_smoothing_matrix(irradiance.shape[-1], factor, _SMOOTHING_CELLS), irradiance)
-
-
-def refine(irradiance: Array, factor: int) -> Array:
-    """Values on a grid `factor` times finer over the last two axes, linear in between."""
-    return _along_both(_smoothing_matrix(irradiance.shape[-1], factor, 0.0), irradiance)
 
 
 def _along_both(step: Array, irradiance: Array) -> Array:

@@ -142,25 +142,25 @@ class Renderer:
         seed: int,
         tell: Callable[[float], None],
     ) -> tuple[NDArray[np.float32], float]:
-        from . import direct, gather, irradiance, trace
+        from . import direct, gather, transport
 
-        with threadpool_limits(1):
-            straight = direct.direct(self.sensor, self.basis, shape)
+        straight = direct.direct(self.sensor, self.basis, shape)
+        ground = transport.survey(self.scene, self.sensor, self.table)
         passes = max(2, -(-samples // _PATHS_PER_PASS))
         runs = []
         for number in range(passes):
-            landed = trace.trace(
-                self.scene,
-                self.sensor,
-                self.table,
-                self.basis,
-                straight,
-                max(samples // passes, 2),
-                seed * _MOST_PASSES + number,
-            )
             with threadpool_limits(1):
-                light = straight + irradiance.smooth(landed)
-            runs.append(gather.picture(sight, self.basis, light))
+                light = transport.transport(
+                    self.scene,
+                    self.sensor,
+                    self.table,
+                    self.basis,
+                    ground,
+                    straight,
+                    max(samples // passes, 2),
+                    seed * _MOST_PASSES + number,
+                )
+            runs.append(gather.picture(sight, light.upward))
             tell((number + 1) / passes)
         # the smoothing kernel has negative sides: next to an edge of light they may undershoot the dark
         radiance = np.maximum(np.mean(runs, axis=0, dtype=np.float64), 0.0)

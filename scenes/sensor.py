@@ -20,6 +20,7 @@ CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False)
 RefractiveIndex = Annotated[float, Field(ge=1.0, le=4.0)]
 # Bounds far outside of what such a sensor has, so that only slips (a unit, a power of ten) are refused.
 Length = Annotated[float, Field(ge=0.05, le=500.0)]
+Absorption = Annotated[float, Field(ge=0.0, le=10.0)]
 PixelSize = Annotated[float, Field(ge=0.1, le=1000.0)]
 Side = Literal["+x", "-x", "+y", "-y"]
 Coupling = Literal["air", "embedded"]
@@ -52,6 +53,9 @@ class Guide:
     refractive_index: Annotated[
         RefractiveIndex, Field(description="Refractive index of the guide at the light's wavelength.")
     ] = 1.4336
+    absorption_per_mm: Annotated[
+        Absorption, Field(description="Absorption coefficient of the guide, 1/mm (PDMS: about 0.001).")
+    ] = 0.0
 
 
 @dataclass(frozen=True, config=CONFIG)
@@ -62,6 +66,9 @@ class Glass:
     refractive_index: Annotated[
         RefractiveIndex, Field(description="Refractive index of the plate at the light's wavelength.")
     ] = 1.515
+    absorption_per_mm: Annotated[
+        Absorption, Field(description="Absorption coefficient of the plate, 1/mm.")
+    ] = 0.0
 
 
 @dataclass(frozen=True, config=CONFIG)
