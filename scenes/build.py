@@ -44,7 +44,7 @@ def load_scene(sensor: Sensor, optics: ContactOptics) -> mi.Scene:
     guide, glass = sensor.guide, sensor.glass
     half, bottom = guide.width_mm / 2, -guide.thickness_mm
     lowest = bottom - glass.thickness_mm
-    side_wall = _dielectric(guide.refractive_index, 1.0)
+    side_wall = _side_wall(sensor)
     scene: dict[str, Any] = {
         "type": "scene",
         "camera": pinhole.describe(sensor),
@@ -58,6 +58,16 @@ def load_scene(sensor: Sensor, optics: ContactOptics) -> mi.Scene:
     for number, led in enumerate(sensor.leds):
         scene[f"led_{number}"] = _led(led, half)
     return mi.load_dict(scene, optimize=False)  # merging would lose the walls' names
+
+
+def _side_wall(sensor: Sensor) -> dict[str, Any]:
+    """Polished where LEDs in air shine through: `trace` paints the walls around their windows."""
+    guide = sensor.guide
+    if guide.walls == "polished" or any(led.coupling == "air" for led in sensor.leds):
+        return _dielectric(guide.refractive_index, 1.0)
+    albedo = guide.wall_albedo if guide.walls == "diffuse" else 0.0
+    paint = {"type": "diffuse", "reflectance": {"type": "uniform", "value": albedo}}
+    return {"type": "twosided", "bsdf": paint}
 
 
 def put_surface(scene: mi.Scene, sensor: Sensor, deformed: surface.OpticalSurface) -> None:

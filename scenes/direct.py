@@ -107,6 +107,7 @@ class _Source:
     inset: mi.Float  # guide between face and disc, 0 if in air
     index: mi.Float
     radius: mi.Float
+    window: mi.Float
     density: mi.Float  # F / (pi m²), W: the disc's area cancels against its mean over points
 
     @staticmethod
@@ -129,6 +130,7 @@ class _Source:
                     inset,
                     medium,
                     lamp.diameter_mm / 2,
+                    lamp.window_mm,
                     density,
                 ]
             )
@@ -176,6 +178,10 @@ def _arrives(
     lit &= dr.abs(path.error.x) + dr.abs(path.error.y) < 1e-2
     entry_z = disc_z - path.entry_z if mirrored else disc_z + path.entry_z
     lit &= (entry_z > -guide.thickness_mm) & (dr.abs(side_y + path.entry_y) < half)
+    if guide.walls != "polished":
+        to_window = mi.Vector2f(source.radius * on_disc.x + path.entry_y, source.radius * on_disc.y)
+        to_window.y += -path.entry_z if mirrored else path.entry_z
+        lit &= (source.gap == 0.0) | (dr.squared_norm(to_window) <= dr.square(source.window))
     tangential2 = dr.square(path.p_y) + dr.square(path.p_z)
     in_air = source.gap > 0.0
     share = dr.select(in_air, 1.0 - _fresnel(mi.Float(1.0), mi.Float(n), tangential2), 1.0)
@@ -229,7 +235,18 @@ def _follow(
     y_y, y_z = source.gap + py_y * run + p_y * run_y, py_z * run + p_y * run_z
     error = mi.Vector2f(p_x * run - along_axis, source.gap * t_y + p_y * run - along_side)
     etendue = dr.square(source.index / one) / dr.abs(x_y * y_z - x_z * y_y)
-    return _Path(p_y, p_z, p_x, source.gap * t_y, source.gap * t_z, error, (x_y, x_z, y_y, y_z), etendue, in_guide, in_glass)
+    return _Path(
+        p_y,
+        p_z,
+        p_x,
+        source.gap * t_y,
+        source.gap * t_z,
+        error,
+        (x_y, x_z, y_y, y_z),
+        etendue,
+        in_guide,
+        in_glass,
+    )
 
 
 def _fresnel(n_in: mi.Float, n_out: mi.Float, tangential2: mi.Float) -> mi.Float:

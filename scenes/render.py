@@ -126,7 +126,7 @@ class Renderer:
 
     def _check_leds(self, shape: surface.OpticalSurface) -> None:
         """Refuse LEDs that the deformed rim would shade: the gathered light knows no shade."""
-        lowest = float(shape.displacement_mm[..., 2].min())
+        lowest = float((shape.rest_mm + shape.displacement_mm[..., 2]).min())
         for number, led in enumerate(self.sensor.leds):
             if led.z_mm + led.diameter_mm / 2 > lowest:
                 allowed = (

@@ -24,6 +24,7 @@ Absorption = Annotated[float, Field(ge=0.0, le=10.0)]
 PixelSize = Annotated[float, Field(ge=0.1, le=1000.0)]
 Side = Literal["+x", "-x", "+y", "-y"]
 Coupling = Literal["air", "embedded"]
+Walls = Literal["polished", "absorbing", "diffuse"]
 
 
 class NotModelled(ValueError):
@@ -56,6 +57,16 @@ class Guide:
     absorption_per_mm: Annotated[
         Absorption, Field(description="Absorption coefficient of the guide, 1/mm (PDMS: about 0.001).")
     ] = 0.0
+    walls: Annotated[
+        Walls,
+        Field(
+            description="Side faces: polished; or painted, but for windows before LEDs in air: absorbing, "
+            "or diffuse (white)."
+        ),
+    ] = "polished"
+    wall_albedo: Annotated[
+        float, Field(ge=0.0, le=1.0, description="Share of light that diffuse walls send back, 0 to 1.")
+    ] = 0.9
 
 
 @dataclass(frozen=True, config=CONFIG)
@@ -113,6 +124,11 @@ class Led:
             description="Distance of the disc from the side face, mm: outside (air) or inside (embedded).",
         ),
     ] = 0.5
+
+    @property
+    def window_mm(self) -> float:
+        """Radius of the window in a painted wall before this LED, if it is in air: light at 45° gets through."""
+        return self.diameter_mm / 2 + self.gap_mm
 
 
 @dataclass(frozen=True, config=CONFIG)

@@ -132,15 +132,22 @@ def walk(
         sink["tissue"] += entering
         elsewhere = alive & ~on_contact
         sample1, sample2 = random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32())
-        scattered, weight = si.bsdf(ray).sample(context, si, sample1, sample2, elsewhere)
+        on_wall = elsewhere & _one_of(si.shape, named, "wall_")
+        painted = _painted(sensor, si, on_wall)
+        scattered, weight = si.bsdf(ray).sample(context, si, sample1, sample2, elsewhere & ~painted)
         kept = dr.select(on_contact, throughput - entering, dr.select(elsewhere, throughput * weight[0], 0.0))
+        direction = dr.select(on_contact, mi.reflect(si.wi), scattered.wo)
+        if sensor.guide.walls != "polished":
+            albedo = sensor.guide.wall_albedo if sensor.guide.walls == "diffuse" else 0.0
+            back = mi.warp.square_to_cosine_hemisphere(sample2)
+            kept = dr.select(painted, dr.select(cosine < 0.0, throughput * albedo, 0.0), kept)
+            direction = dr.select(painted, mi.Vector3f(back.x, back.y, -back.z), direction)
         stopped = dr.select(elsewhere, throughput - kept, 0.0)
         on_led = _one_of(si.shape, named, "led_")
         sink["leds"] += dr.select(on_led, stopped, 0.0)
         sink["walls"] += dr.select(on_led, 0.0, stopped)
-        direction = dr.select(on_contact, mi.reflect(si.wi), scattered.wo)
         passed = elsewhere & (cosine * mi.Frame3f.cos_theta(direction) < 0.0)
-        leg = _next_leg(leg, si.shape, passed, named)
+        leg = _next_leg(leg, si.shape, on_wall, passed, named)
 
         survive = dr.select(bounce < _SURE_BOUNCES, 1.0, dr.minimum(kept, 0.95))
         alive &= (kept > 0.0) & (random.next_float32() < survive) & (bounce < _MAX_BOUNCES)
@@ -242,6 +249,19 @@ def _absorb(
     return throughput
 
 
+def _painted(sensor: Sensor, si: mi.SurfaceInteraction3f, on_wall: mi.Bool) -> mi.Bool:
+    """Where walls are painted: all over, but for the windows before LEDs in air."""
+    if sensor.guide.walls == "polished":
+        return mi.Bool(False)
+    half, painted = sensor.guide.width_mm / 2, on_wall
+    for led in sensor.leds:
+        if led.coupling == "air":
+            centre, axis, _ = led_frame(led, half)
+            middle = mi.Point3f(*(centre + led.gap_mm * axis).tolist())
+            painted = painted & (dr.squared_norm(si.p - middle) > led.window_mm**2)
+    return painted
+
+
 def _one_of(shape: mi.ShapePtr, named: dict[str, mi.ShapePtr], prefix: str) -> mi.Bool:
     """Whether a shape is one of those whose name begins so."""
     found = mi.Bool(False)
@@ -252,10 +272,9 @@ def _one_of(shape: mi.ShapePtr, named: dict[str, mi.ShapePtr], prefix: str) -> m
 
 
 def _next_leg(
-    leg: mi.UInt32, shape: mi.ShapePtr, passed: mi.Bool, named: dict[str, mi.ShapePtr]
+    leg: mi.UInt32, shape: mi.ShapePtr, on_wall: mi.Bool, passed: mi.Bool, named: dict[str, mi.ShapePtr]
 ) -> mi.UInt32:
     """The leg after an event at `shape`, `passed` if light went through it."""
-    on_wall = _one_of(shape, named, "wall_")
     upper, lower = shape == named["guide_to_glass"], shape == named["glass_to_air"]
     following = mi.UInt32(OTHER)
     for before, event, after in (

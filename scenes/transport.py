@@ -107,20 +107,20 @@ def transport(
     flux = np.array([led.flux_W for led in sensor.leds])
     starts = np.random.Generator(np.random.Philox(seed)).integers(0, 2**32, size=(_ORDERS + 1, 4))
 
-    def walk(
-        order: int, each: int, upward: Array | None
-    ) -> tuple[Array, Array, Array, Array]:
+    def walk(order: int, each: int, upward: Array | None) -> tuple[Array, Array, Array, Array]:
         index = dr.arange(mi.UInt32, n_led * each)
         number = index // mi.UInt32(dr.opaque(mi.UInt32, each))
         place = index - number * dr.opaque(mi.UInt32, each)
         u = trace.evenly(place, starts[order])
         if upward is None:
             in_air = mi.Bool(np.array([led.coupling == "air" for led in sensor.leds]))
-            leg = dr.select(dr.gather(mi.Bool, in_air, number), mi.UInt32(trace.IN_AIR), mi.UInt32(trace.IN_GUIDE))
+            leg = dr.select(
+                dr.gather(mi.Bool, in_air, number), mi.UInt32(trace.IN_AIR), mi.UInt32(trace.IN_GUIDE)
+            )
             ray, amount, scale = trace.emit(sensor, number, u), dr.full(mi.Float, 1.0, n_led * each), flux
         else:
             ray, amount = trace.re_emit(scene, sensor, table, upward, number, u)
-            scale = upward.mean(axis=(1, 2)) * sensor.guide.width_mm ** 2
+            scale = upward.mean(axis=(1, 2)) * sensor.guide.width_mm**2
             amount /= dr.gather(mi.Float, mi.Float(np.maximum(scale, 1e-30)), number)
             leg = mi.UInt32(trace.OTHER)
         begun = np.asarray(amount, dtype=np.float64).reshape(n_led, each).mean(axis=1)

@@ -23,7 +23,7 @@ def shaped(
     line = np.linspace(-HALF_MM, HALF_MM, nodes)
     x, y = np.meshgrid(line, line)
     shift = np.stack([v + 0.0 * x for v in displacement(x, y)], axis=-1)
-    return OpticalSurface(line, shift, pressure(x, y))
+    return OpticalSurface(line, shift, pressure(x, y), 0 * x)
 
 
 # Resampling

@@ -223,7 +223,7 @@ def test_camera_looks_at_the_deformed_surface(mi: ModuleType) -> None:
     line = np.linspace(-HALF_MM, HALF_MM, NODES)
     x, _ = np.meshgrid(line, line)
     plane = np.stack([0 * x, 0 * x, -0.2 + 0.01 * x], axis=-1)
-    build.put_surface(scene, sensor, OpticalSurface(line, plane, np.ones_like(x)))
+    build.put_surface(scene, sensor, OpticalSurface(line, plane, np.ones_like(x), 0 * x))
     rays = view.pixel_rays(sensor)
     sight = gather.look(scene, sensor, Table(Table.pack(optics)), rays)
     slope = np.array([0.01, 0.0, -1.0])
