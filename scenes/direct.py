@@ -235,18 +235,8 @@ def _follow(
     y_y, y_z = source.gap + py_y * run + p_y * run_y, py_z * run + p_y * run_z
     error = mi.Vector2f(p_x * run - along_axis, source.gap * t_y + p_y * run - along_side)
     etendue = dr.square(source.index / one) / dr.abs(x_y * y_z - x_z * y_y)
-    return _Path(
-        p_y,
-        p_z,
-        p_x,
-        source.gap * t_y,
-        source.gap * t_z,
-        error,
-        (x_y, x_z, y_y, y_z),
-        etendue,
-        in_guide,
-        in_glass,
-    )
+    derivative, entry = (x_y, x_z, y_y, y_z), (source.gap * t_y, source.gap * t_z)
+    return _Path(p_y, p_z, p_x, *entry, error, derivative, etendue, in_guide, in_glass)
 
 
 def _fresnel(n_in: mi.Float, n_out: mi.Float, tangential2: mi.Float) -> mi.Float:

@@ -54,9 +54,7 @@ def look(scene: mi.Scene, sensor: Sensor, table: Table, rays: PixelRays) -> Sigh
     contact = next(shape for shape in scene.shapes() if shape.id() == "contact")
 
     named = {shape.id(): mi.ShapePtr(shape) for shape in scene.shapes()}
-    squeezed = (
-        guide.refractive_index / sensor.tissue.refractive_index
-    ) ** 2  # tissue's radiance in the guide
+    squeezed = (guide.refractive_index / sensor.tissue.refractive_index) ** 2  # radiance, tissue to guide
     lamps = [mi.Float(0.0) for _ in sensor.leds]
     points = []
     start = mi.Point3f(*origin) + _STEP_MM / direction.z * direction

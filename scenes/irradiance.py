@@ -71,7 +71,7 @@ def transmitted(basis: AngularBasis, irradiance: Array, fraction: Array) -> Arra
 
 
 def by_fraction(rows: Array, fraction: Array) -> Array:
-    """Rows (n_fraction, ...) of a table, uniform on 0..1, at fractions (m, m): (m, m, ...), linear between."""
+    """Rows (n_fraction, ...) of a table, uniform on 0..1, at fractions (m, m): (m, m, ...)."""
     last = len(rows) - 1
     at = np.clip(fraction, 0.0, 1.0) * last
     node = np.minimum(at.astype(np.int64), last - 1)

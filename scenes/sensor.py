@@ -127,7 +127,7 @@ class Led:
 
     @property
     def window_mm(self) -> float:
-        """Radius of the window in a painted wall before this LED, if it is in air: light at 45° gets through."""
+        """Radius of the window before this LED in a painted wall: light from its rim gets in at 45°."""
         return self.diameter_mm / 2 + self.gap_mm
 
 

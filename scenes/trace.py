@@ -23,9 +23,9 @@ from .sensor import Sensor
 Array = NDArray[np.float64]
 
 CELLS = 100  # of the irradiance grid, per side
-SINKS = ("tissue", "guide", "glass", "walls", "leds", "below", "aside")
-"""Where light ends: enters the tissue; absorbed in guide, glass, by walls and rims, by LEDs' bodies; leaves
-downwards; leaves through the sides, or never went in."""
+SINKS = ("tissue", "guide", "glass", "walls", "frame", "leds", "below", "aside")
+"""Where light ends: enters the tissue; absorbed in guide, glass, by painted walls, the glass's black frame,
+LEDs' bodies; leaves downwards; leaves through the sides, or never went in."""
 
 # Deposits are summed as integers: the sum does not depend on the order of threads
 _FIXED_POINT = float(2**20)
@@ -145,7 +145,8 @@ def walk(
         stopped = dr.select(elsewhere, throughput - kept, 0.0)
         on_led = _one_of(si.shape, named, "led_")
         sink["leds"] += dr.select(on_led, stopped, 0.0)
-        sink["walls"] += dr.select(on_led, 0.0, stopped)
+        sink["walls"] += dr.select(on_wall, stopped, 0.0)
+        sink["frame"] += dr.select(on_led | on_wall, 0.0, stopped)
         passed = elsewhere & (cosine * mi.Frame3f.cos_theta(direction) < 0.0)
         leg = _next_leg(leg, si.shape, on_wall, passed, named)
 

@@ -1,4 +1,4 @@
-"""From LEDs to the light that leaves the tissue: walks through the guide and passes through the tissue in turn.
+"""From LEDs to the light that leaves the tissue: walks through the guide and passes in the tissue in turn.
 
 Import only after a variant is set (`scenes.backend.use`).
 """
@@ -113,10 +113,8 @@ def transport(
         place = index - number * dr.opaque(mi.UInt32, each)
         u = trace.evenly(place, starts[order])
         if upward is None:
-            in_air = mi.Bool(np.array([led.coupling == "air" for led in sensor.leds]))
-            leg = dr.select(
-                dr.gather(mi.Bool, in_air, number), mi.UInt32(trace.IN_AIR), mi.UInt32(trace.IN_GUIDE)
-            )
+            legs = [trace.IN_AIR if led.coupling == "air" else trace.IN_GUIDE for led in sensor.leds]
+            leg = dr.gather(mi.UInt32, mi.UInt32(np.array(legs, dtype=np.uint32)), number)
             ray, amount, scale = trace.emit(sensor, number, u), dr.full(mi.Float, 1.0, n_led * each), flux
         else:
             ray, amount = trace.re_emit(scene, sensor, table, upward, number, u)
