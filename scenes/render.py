@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     import pyvista as pv
 
     from .gather import Sight
+    from .transport import Light
 
 Quality = Literal["preview", "standard", "reference"]
 
@@ -48,6 +49,9 @@ class Rendering:
         per cent of the mean; from the spread of independent passes (traced) or of the samples (reference).
     seconds : float
         Wall-clock time.
+    sinks, trapped : (n_led, len(trace.SINKS)) and (n_led,), or None
+        W that end in each sink, and W trapped at their first contact with the surface (see
+        `transport.Light`); None for the reference quality.
     """
 
     radiance: NDArray[np.float32]
@@ -56,6 +60,8 @@ class Rendering:
     displacement_z: NDArray[np.float32]
     noise_percent: float
     seconds: float
+    sinks: NDArray[np.float64] | None = None
+    trapped: NDArray[np.float64] | None = None
 
 
 class Renderer:
@@ -114,14 +120,22 @@ class Renderer:
         shape = surface.resample(pressed, self.sensor.guide.width_mm, suffix=field.removeprefix("pressure"))
         build.put_surface(self.scene, self.sensor, shape)
         sight = gather.look(self.scene, self.sensor, self.table, self.rays)
+        lights: list[Light] = []
         if quality == "reference":
             radiance, noise = self._reference(samples or REFERENCE_SAMPLES, seed, tell)
         else:
             self._check_leds(shape)
-            radiance, noise = self._traced(shape, sight, samples or PATHS_PER_LED[quality], seed, tell)
+            radiance, noise = self._traced(shape, sight, samples or PATHS_PER_LED[quality], seed, tell, lights)
         pressure, displacement_z = surface.at(shape, sight.position_mm)
         return Rendering(
-            radiance, sight.position_mm, pressure, displacement_z, noise, time.perf_counter() - start
+            radiance,
+            sight.position_mm,
+            pressure,
+            displacement_z,
+            noise,
+            time.perf_counter() - start,
+            np.mean([light.sinks for light in lights], axis=0) if lights else None,
+            np.mean([light.trapped for light in lights], axis=0) if lights else None,
         )
 
     def _check_leds(self, shape: surface.OpticalSurface) -> None:
@@ -141,7 +155,9 @@ class Renderer:
         samples: int,
         seed: int,
         tell: Callable[[float], None],
+        lights: list[Light],
     ) -> tuple[NDArray[np.float32], float]:
+        """Radiance and its noise; `lights` takes what each pass found."""
         from . import direct, gather, transport
 
         straight = direct.direct(self.sensor, self.basis, shape)
@@ -160,6 +176,7 @@ class Renderer:
                     max(samples // passes, 2),
                     seed * _MOST_PASSES + number,
                 )
+            lights.append(light)
             runs.append(gather.picture(sight, light.upward))
             tell((number + 1) / passes)
         # the smoothing kernel has negative sides: next to an edge of light they may undershoot the dark
