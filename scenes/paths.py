@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from . import trace
 from .bsdf import Table
 from .sensor import Sensor
+from .view import PixelRays
 
 FATES = (*trace.SINKS, "missed", "going")
 """How a path ends: a sink of `trace` ("tissue": it enters the tissue); "missed": it went by the guide or was
@@ -45,6 +46,8 @@ class Paths:
         LED that the path comes from.
     first_cosine : (n,)
         Cosine of incidence where the path first comes to the contact surface; NaN if it never does.
+    entered : (n,)
+        Whether the path ever ran through the guide.
     """
 
     vertices_mm: NDArray[np.float32]
@@ -53,6 +56,7 @@ class Paths:
     fate: NDArray[np.int64]
     led: NDArray[np.int64]
     first_cosine: NDArray[np.float32]
+    entered: NDArray[np.bool_]
 
 
 def from_leds(
@@ -117,7 +121,22 @@ def record(
         np.asarray(fate).astype(np.int64),
         np.asarray(number).astype(np.int64),
         np.asarray(first),
+        np.asarray(inside).astype(bool),
     )
+
+
+def in_sight(scene: mi.Scene, sensor: Sensor, rays: PixelRays) -> NDArray[np.float64]:
+    """Share of the camera's pixels that look straight into each LED, (n_led,)."""
+    origin, direction = (
+        [mi.Float(np.ascontiguousarray(part[..., axis], dtype=np.float32).ravel()) for axis in range(3)]
+        for part in (rays.origin_mm, rays.direction)
+    )
+    aim = mi.Vector3f(*direction)
+    si = scene.ray_intersect(mi.Ray3f(mi.Point3f(*origin) + 1e-3 / aim.z * aim, aim))
+    front = si.is_valid() & (mi.Frame3f.cos_theta(si.wi) > 0.0)
+    shapes = {shape.id(): mi.ShapePtr(shape) for shape in scene.shapes()}
+    leds = [front & (si.shape == shapes[f"led_{number}"]) for number in range(len(sensor.leds))]
+    return np.array([np.mean(np.asarray(meets)) for meets in leds])
 
 
 def _step(  # type: ignore[no-untyped-def]

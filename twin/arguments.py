@@ -36,6 +36,18 @@ examples:
   twin simulate my-sensor.toml --no-inclusion --force 0.5 --mechanics linear --out flat
 """
 
+_CHECK = """\
+Look a sensor over, on its press and a standard inclusion (10 mm across, 5 mm deep, 100 kPa), at preview
+quality: where each LED's light goes, in per cent of what it emits; exposure; signal over noise; and what is
+wrong, errors first, each with why it matters and what to change. Exit status 0 also where something is wrong;
+2 where the design cannot be read. With --out, check.json and check.png: sample light paths and the balance.
+
+examples:
+  twin check tsis
+  twin check my-sensor.toml --indentation 3 --out checked
+  twin check tsis --json | jq .findings
+"""
+
 _EXPORT = """\
 Press a sensor on a slab of tissue and write the mechanics for other programs: displacement, stress and
 materials throughout as VTU, which ParaView opens, or the same press, with and without the inclusion, as
@@ -93,6 +105,21 @@ def _parser() -> Parser:
     )
     _add_run_flags(simulate)
 
+    check = _verb(verbs, "check", "where the light goes, exposure, signal, mistakes: with advice", _CHECK)
+    check.add_argument(
+        "design", metavar="DESIGN", nargs="?", default="tsis", help="name or TOML file (default tsis)"
+    )
+    _add_mechanics_flag(check, "linear")
+    check.add_argument(
+        "--indentation",
+        type=number(above=0.0),
+        metavar="MM",
+        help="depth of the press (default: the design's deepest)",
+    )
+    check.add_argument("--json", action="store_true", help="print JSON instead of tables")
+    check.add_argument("--out", metavar="DIR", help="new folder for check.json and check.png")
+    _add_light_flags(check)
+
     export = _verb(verbs, "export", "a press as files for ParaView or CalculiX", _EXPORT)
     export.add_argument(
         "design", metavar="DESIGN", nargs="?", default="tsis", help="name or TOML file (default tsis)"
@@ -137,14 +164,20 @@ def _add_inclusion_flags(parser: Parser) -> None:
 
 
 def _add_pose_flags(parser: Parser) -> None:
+    _add_mechanics_flag(parser)
+    _add_pair(parser, "--tilt", "turn of the sensor about x, then y, degrees (default: the design's)")
+    _add_pair(parser, "--position", "sensor's centre minus the specimen's, mm (default: the design's)")
+
+
+def _add_mechanics_flag(parser: Parser, default: str | None = None) -> None:
+    otherwise = default or "the design's"
     parser.add_argument(
         "--mechanics",
         type=choice(*MECHANICS),
+        default=default,
         metavar="M",
-        help=" or ".join(MECHANICS) + " strain (default: the design's)",
+        help=f"{' or '.join(MECHANICS)} strain (default: {otherwise})",
     )
-    _add_pair(parser, "--tilt", "turn of the sensor about x, then y, degrees (default: the design's)")
-    _add_pair(parser, "--position", "sensor's centre minus the specimen's, mm (default: the design's)")
 
 
 def _add_depths(place: Any) -> None:
@@ -170,6 +203,10 @@ def _add_run_flags(parser: Parser, out: str | None = None) -> None:
     default = "" if out is None else f" (default {out})"
     parser.add_argument("--out", metavar="DIR", default=out, help="new folder for the results" + default)
     _add_quality_flag(parser, "; reference traces paths from the camera: hours")
+    _add_light_flags(parser)
+
+
+def _add_light_flags(parser: Parser) -> None:
     parser.add_argument(
         "--seed", type=whole, default=0, metavar="N", help="of all random numbers (default 0)"
     )

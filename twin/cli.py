@@ -1,4 +1,4 @@
-"""The command line: ``twin demo``, ``twin simulate``, ``twin export``, ``twin schema``.
+"""The command line: ``twin demo``, ``simulate``, ``check``, ``export``, ``schema``.
 
 Exit status 0: done; 1: the machine failed (a full disk); 2: bad input, one line on stderr; 130: interrupted.
 Nothing slow is imported until the input has been checked.
@@ -12,6 +12,7 @@ import os
 import re
 import sys
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
@@ -99,6 +100,8 @@ def _run(arguments: argparse.Namespace) -> int:
         design, inclusion = _pressed(arguments), _inclusion(arguments)
         levels = arguments.force or arguments.indentation or design.press.indentation_mm
         _simulate(arguments, design, inclusion, levels, by_force=bool(arguments.force))
+    elif arguments.verb == "check":
+        _check(arguments)
     elif arguments.verb == "export":
         _export(arguments, _pressed(arguments), _inclusion(arguments))
     else:
@@ -138,6 +141,46 @@ def _simulate(
         fill(frames, folder)
         interrupt.stop_if_asked()
     summarise(frames, Path(arguments.out))
+
+
+def _check(arguments: argparse.Namespace) -> None:
+    from twin import findings, prescription
+
+    try:
+        design = load_design(arguments.design).pressed(mechanics=arguments.mechanics)
+    except DesignError as error:
+        if not error.conflicts:
+            raise
+        # every value can be read, but some do not fit: that is what a doctor is for
+        found = findings.from_conflicts(error.conflicts)
+        prescription.show(None, found, str(arguments.design), as_json=arguments.json)
+        if arguments.out is not None:
+            with staged(arguments.out, prescription.holds_checkup) as folder:
+                prescription.fill(None, found, str(arguments.design), folder)
+        return
+    from twin import doctor
+    from twin.reporting import Reporter
+
+    def tell(stage: str, done: float) -> None:
+        interrupt.stop_if_asked()
+        report(stage, _SIMULATION_SHARE * done)
+
+    with ExitStack() as stack:
+        folder = None
+        if arguments.out is not None:
+            folder = stack.enter_context(staged(arguments.out, prescription.holds_checkup))
+        report = stack.enter_context(Reporter())
+        checkup = doctor.check_up(
+            design, arguments.indentation, seed=arguments.seed, device=arguments.device, progress=tell
+        )
+        found = findings.findings(checkup)
+        if folder is not None:
+            tell("files", 1.0)
+            prescription.fill(checkup, found, design.name, folder)
+        interrupt.stop_if_asked()
+    prescription.show(checkup, found, design.name, as_json=arguments.json)
+    if arguments.out is not None and not arguments.json:
+        print(f"look at: {Path(arguments.out) / prescription.PICTURE}")
 
 
 def _export(arguments: argparse.Namespace, design: Design, inclusion: fem.Inclusion | None) -> None:

@@ -1,0 +1,1 @@
+def draw(c,p): p.write_bytes(b"x")
