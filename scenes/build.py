@@ -41,6 +41,12 @@ def load_scene(sensor: Sensor, optics: ContactOptics) -> mi.Scene:
     held in a black frame and nothing surrounds the sensor (a black housing). Side walls stay flat: their
     bulge under load, 0.1 mm, is left out.
     """
+    scene = describe(sensor, _contact_mesh(sensor, optics))
+    return mi.load_dict(scene, optimize=False)  # merging would lose the walls' names
+
+
+def describe(sensor: Sensor, contact: mi.Mesh | dict[str, Any]) -> dict[str, Any]:
+    """The scene as Mitsuba's dictionary, with this contact surface."""
     guide, glass = sensor.guide, sensor.glass
     half, bottom = guide.width_mm / 2, -guide.thickness_mm
     lowest = bottom - glass.thickness_mm
@@ -48,7 +54,7 @@ def load_scene(sensor: Sensor, optics: ContactOptics) -> mi.Scene:
     scene: dict[str, Any] = {
         "type": "scene",
         "camera": pinhole.describe(sensor),
-        "contact": _contact_mesh(sensor, optics),
+        "contact": contact,
         "guide_to_glass": _face(half, bottom, _dielectric(guide.refractive_index, glass.refractive_index)),
         "glass_to_air": _face(half, lowest, _dielectric(glass.refractive_index, 1.0)),
     }
@@ -57,7 +63,7 @@ def load_scene(sensor: Sensor, optics: ContactOptics) -> mi.Scene:
         scene[f"rim_{side}"] = _wall(half, lowest, bottom, outward, _BLACK)
     for number, led in enumerate(sensor.leds):
         scene[f"led_{number}"] = _led(led, half)
-    return mi.load_dict(scene, optimize=False)  # merging would lose the walls' names
+    return scene
 
 
 def _side_wall(sensor: Sensor) -> dict[str, Any]:

@@ -125,7 +125,9 @@ class Renderer:
             radiance, noise = self._reference(samples or REFERENCE_SAMPLES, seed, tell)
         else:
             self._check_leds(shape)
-            radiance, noise = self._traced(shape, sight, samples or PATHS_PER_LED[quality], seed, tell, lights)
+            radiance, noise = self._traced(
+                shape, sight, samples or PATHS_PER_LED[quality], seed, tell, lights
+            )
         pressure, displacement_z = surface.at(shape, sight.position_mm)
         return Rendering(
             radiance,

@@ -49,14 +49,21 @@ examples:
 """
 
 _EXPORT = """\
-Press a sensor on a slab of tissue and write the mechanics for other programs: displacement, stress and
-materials throughout as VTU, which ParaView opens, or the same press, with and without the inclusion, as
-input decks of CalculiX. No light is computed. Lengths are mm, moduli kPa.
+Press a sensor on a slab of tissue and write it for other programs; no light is computed. Lengths are mm,
+moduli kPa.
+  --vtu      displacement, stress and materials throughout, which ParaView opens
+  --ccx      the same press, with and without the inclusion, as input decks of CalculiX
+  --mitsuba  the scene as XML, PLY and a table, which the stock mitsuba package loads with mi.load_file; our
+             plugins are registered by one import after mi.set_variant("llvm_ad_mono"): import scenes.plugins
+  --stl      guide, contact surface and glass as meshes
+  --ply      the same, with pressure and real contact fraction at the contact surface's vertices
 
 examples:
   twin export --size 10 --depth 5 --modulus 100 --indentation 2 --vtu press.vtu
   twin export my-sensor.toml --no-inclusion --tilt 0 3 --mechanics linear --vtu tilted.vtu
   twin export tsis --size 10 --depth 5 --modulus 100 --indentation 1 2 3 --ccx decks
+  twin export tsis --size 10 --depth 5 --modulus 100 --mitsuba scene
+  twin export tsis --no-inclusion --ply meshes
 """
 
 _SCHEMA = """\
@@ -120,7 +127,7 @@ def _parser() -> Parser:
     check.add_argument("--out", metavar="DIR", help="new folder for check.json and check.png")
     _add_light_flags(check)
 
-    export = _verb(verbs, "export", "a press as files for ParaView or CalculiX", _EXPORT)
+    export = _verb(verbs, "export", "a press as files for ParaView, CalculiX, Mitsuba", _EXPORT)
     export.add_argument(
         "design", metavar="DESIGN", nargs="?", default="tsis", help="name or TOML file (default tsis)"
     )
@@ -130,6 +137,9 @@ def _parser() -> Parser:
     kind = export.add_mutually_exclusive_group()
     kind.add_argument("--vtu", metavar="FILE.vtu", help="volume results of one press, for ParaView")
     kind.add_argument("--ccx", metavar="DIR", help="input decks for CalculiX, one step per press depth")
+    kind.add_argument("--mitsuba", metavar="DIR", help="one press as a scene for the stock mitsuba package")
+    kind.add_argument("--stl", metavar="DIR", help="one press as STL meshes")
+    kind.add_argument("--ply", metavar="DIR", help="one press as PLY meshes with fields")
     _add_quality_flag(export)
 
     _verb(verbs, "schema", "the JSON schema of a design file", _SCHEMA)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     import pyvista as pv
 
     from fem import Press
-    from scenes import Renderer, Rendering
+    from scenes import Rendering
     from scenes.paths import Paths
 
 STANDARD = fem.Inclusion(size=10.0, depth=5.0, modulus=100.0)
@@ -34,8 +34,11 @@ STANDARD = fem.Inclusion(size=10.0, depth=5.0, modulus=100.0)
 FILL = 0.8
 """Share of the counts' range that the advised exposure fills with all but the brightest 0.1 % of pixels."""
 
-_BRIGHTEST = 99.9  # per cent of the pixels that the advised exposure must not saturate
+_BRIGHTEST = 0.1  # per cent of the pixels that the advised exposure may saturate
+_SPOTS = 3.0  # pixels of an LED's spot, with its edge and mirror image, over those that look straight at it
 _LIGHT_PATHS = 2**17  # per LED, for the balance; the other pictures take half of them
+_MORE = 4  # times as many, where the balance is off by more than
+_ROUGH_PERCENT = 0.15
 _SAMPLE_PATHS = 2**12  # per LED, recorded
 _NOISE_FRAMES, _NOISE_REACH = 8, 7  # pictures, and pixels about the signal, that tell the camera's noise
 
@@ -114,7 +117,12 @@ class Checkup:
     @property
     def closure_percent(self) -> Array:
         """Sum of all sinks minus what was emitted, per cent of the latter, for each LED."""
-        return np.sum(list(self.sinks.values()), axis=0) - 100.0
+        return np.asarray(np.sum(list(self.sinks.values()), axis=0) - 100.0 * (self.emitted_W > 0))
+
+    @property
+    def spots_percent(self) -> float:
+        """About the share of the pixels that the spots of LEDs in sight take."""
+        return _SPOTS * float(self.in_sight_percent.sum())
 
     def together(self, share: Array) -> float:
         """A share of the LEDs, weighted with their flux."""
@@ -156,6 +164,15 @@ def check_up(
     from scenes import paths, surface
 
     hovering = untouched(design)
+    emitted = np.array([led.flux_W for led in design.leds])
+
+    def balanced(surface: pv.PolyData, field: str = "pressure") -> Rendering:
+        found = renderer.render(surface, field=field, quality="preview", seed=seed, samples=_LIGHT_PATHS)
+        if np.abs(_off(found, emitted)).max() > _ROUGH_PERCENT:
+            more = _MORE * _LIGHT_PATHS
+            found = renderer.render(surface, field=field, quality="preview", seed=seed, samples=more)
+        return found
+
     background = renderer.render(hovering, quality="preview", seed=seed, samples=_LIGHT_PATHS // 2)
     blank = standard = None
     followed = hovering
@@ -170,14 +187,13 @@ def check_up(
                     press.surface, quality="preview", seed=seed, samples=_LIGHT_PATHS // 2
                 )
             tell("light under the press", 0.55)
-            blank = renderer.render(
-                press.surface, field="pressure_0", quality="preview", seed=seed, samples=_LIGHT_PATHS
-            )
+            blank = balanced(press.surface, "pressure_0")
             followed = press.surface
         except NotModelled as error:
             failures.append(str(error))
             standard = None
-            renderer.render(hovering, quality="preview", seed=seed, samples=2**8)  # puts the surface back
+    if blank is None:
+        background = balanced(hovering)
     lit = blank or background
     tell("sample paths", 0.75)
     recorded = paths.from_leds(renderer.scene, renderer.sensor, renderer.table, _SAMPLE_PATHS, seed)
@@ -186,7 +202,7 @@ def check_up(
     )
     tell("camera", 0.9)
     found = _signal(design, standard, blank, seed) if standard and blank else None
-    emitted = np.array([led.flux_W for led in design.leds])
+    in_sight = 100.0 * paths.in_sight(renderer.scene, renderer.sensor, renderer.rays)
     checkup = Checkup(
         design=design,
         indentation_mm=depth,
@@ -195,13 +211,13 @@ def check_up(
         first=_first(design, lit, recorded, emitted),
         detected=_detected(design, lit, emitted),
         lit_percent=_shares(lit),
-        in_sight_percent=100.0 * paths.in_sight(renderer.scene, renderer.sensor, renderer.rays),
+        in_sight_percent=in_sight,
         light_is_pressed=blank is not None,
         background=_exposure(design, background, seed),
         blank=_exposure(design, blank, seed) if blank else None,
         standard=_exposure(design, standard, seed) if standard else None,
         signal=found,
-        advised_exposure_ms=_advised(design, standard or lit),
+        advised_exposure_ms=_advised(design, standard or lit, in_sight),
         rim_mm=rim,
         noise_percent=lit.noise_percent,
         uniformity=_uniformity(lit),
@@ -251,6 +267,11 @@ def _sinks(rendering: Rendering, emitted: Array) -> dict[str, Array]:
 
     assert rendering.sinks is not None
     return {name: _percent(rendering.sinks[:, k], emitted) for k, name in enumerate(SINKS)}
+
+
+def _off(rendering: Rendering, emitted: Array) -> Array:
+    """Sum of each LED's sinks minus what it emits, per cent of the latter; 0 for one that is off."""
+    return np.asarray(np.sum(list(_sinks(rendering, emitted).values()), axis=0) - 100.0 * (emitted > 0))
 
 
 def _first(design: Design, rendering: Rendering, paths: Paths, emitted: Array) -> dict[str, Array]:
@@ -305,13 +326,14 @@ def _exposure(design: Design, rendering: Rendering, seed: int) -> Exposure:
     return Exposure(brightest, float(mean.mean()), saturated_percent(design, image, rendering.radiance))
 
 
-def _advised(design: Design, rendering: Rendering) -> float | None:
+def _advised(design: Design, rendering: Rendering, in_sight: Array) -> float | None:
     """Exposure time that fills `FILL` of the range, ms, to two figures; within what a design may say."""
     from scenes.camera import mean_electrons
 
     camera = design.camera
     electrons = mean_electrons(camera, _total(rendering), design.light.wavelength_nm)
-    bright = float(np.percentile(electrons, _BRIGHTEST))
+    spared = min(_BRIGHTEST + _SPOTS * float(in_sight.sum()), 50.0)
+    bright = float(np.percentile(electrons, 100.0 - spared))
     if bright <= 0.0:
         return None
     top = min((2**camera.bits - 1 - camera.offset_dn) * camera.gain_e_per_dn, camera.full_well_e)
@@ -325,67 +347,18 @@ def _signal(design: Design, standard: Rendering, blank: Rendering, seed: int) ->
 
     camera, wavelength = design.camera, design.light.wavelength_nm
     lit, unlit = _total(standard), _total(blank)
-    tared = mean_counts(camera, lit, wavelength) - mean_counts(camera, unlit, wavelength)
+    top = 2**camera.bits - 1
+    tared = np.minimum(mean_counts(camera, lit, wavelength), top)
+    tared -= np.minimum(mean_counts(camera, unlit, wavelength), top)
     smooth = uniform_filter(tared, 3, mode="nearest")
     row, column = np.unravel_index(int(smooth.argmax()), smooth.shape)
     rng = np.random.default_rng(seed)
-    near = (slice(max(row - _NOISE_REACH, 0), row + _NOISE_REACH + 1),) + (
-        slice(max(column - _NOISE_REACH, 0), column + _NOISE_REACH + 1),
-    )
+    rows = slice(max(row - _NOISE_REACH, 0), row + _NOISE_REACH + 1)
+    columns = slice(max(column - _NOISE_REACH, 0), column + _NOISE_REACH + 1)
+    near = (rows, columns)
     frames = np.stack(
         [expose(camera, lit, wavelength, rng)[near].astype(np.float64) for _ in range(_NOISE_FRAMES)]
     )
     noise = float(np.sqrt(np.mean(np.var(frames, axis=0, ddof=1))))
     # a saturated pixel does not stir; the converter's step is always there
     return Signal(float(smooth.max()), max(noise, 1.0 / np.sqrt(12.0)), (int(row), int(column)))
-
-
-def as_json(checkup: Checkup) -> dict[str, Any]:
-    """What was measured, as plain numbers with units in their names."""
-    design, signal = checkup.design, checkup.signal
-
-    def shares(values: dict[str, Array]) -> dict[str, Any]:
-        return {
-            name: {"per_led": [float(v) for v in part], "all": checkup.together(part)}
-            for name, part in values.items()
-        }
-
-    def exposure(part: Exposure | None) -> dict[str, float] | None:
-        return None if part is None else dict(vars(part))
-
-    return {
-        "design": design.name,
-        "press": {"indentation_mm": checkup.indentation_mm, "mechanics": design.mechanics},
-        "light": {
-            "emitted_W": [float(v) for v in checkup.emitted_W],
-            "pressed": checkup.light_is_pressed,
-            "first_percent": shares(checkup.first),
-            "sinks_percent": shares(checkup.sinks),
-            "detected_percent": shares({"detected": checkup.detected})["detected"],
-            "closure_percent": shares({"closure": checkup.closure_percent})["closure"],
-            "picture_share_percent": [float(v) for v in checkup.lit_percent],
-            "in_sight_percent": [float(v) for v in checkup.in_sight_percent],
-            "noise_percent": checkup.noise_percent,
-        },
-        "exposure": {
-            "exposure_ms": design.camera.exposure_ms,
-            "advised_exposure_ms": checkup.advised_exposure_ms,
-            "range_dn": 2**design.camera.bits - 1,
-            "background": exposure(checkup.background),
-            "blank": exposure(checkup.blank),
-            "standard": exposure(checkup.standard),
-        },
-        "signal": None
-        if signal is None
-        else {
-            "inclusion": {"size_mm": STANDARD.size, "depth_mm": STANDARD.depth}
-            | {"modulus_kPa": STANDARD.modulus},
-            "max_dn": signal.counts,
-            "noise_dn": signal.noise_dn,
-            "over_noise": signal.over_noise,
-            "at_px": list(signal.at_px),
-        },
-        "rim_mm": checkup.rim_mm,
-        "uniformity": checkup.uniformity if np.isfinite(checkup.uniformity) else None,
-        "not_computed": list(checkup.failures),
-    }

@@ -1,4 +1,4 @@
-"""What the sensor doctor makes of a checkup: each finding says what was found, why it matters, what to change.
+"""What the sensor doctor makes of a checkup: what was found, why it matters, what to change.
 
 Pure functions of a `twin.doctor.Checkup`, so that every rule can be tried on made-up figures.
 """
@@ -74,7 +74,13 @@ def from_conflicts(conflicts: Sequence[DesignError]) -> list[Finding]:
             (text for pattern, text in _WHY if re.fullmatch(pattern, conflict.field)), "values contradict"
         )
         found.append(
-            Finding("error", conflict.field, f"is {conflict.received}", _sentence(why), f"Allowed: {conflict.allowed}")
+            Finding(
+                "error",
+                conflict.field,
+                f"is {conflict.received}",
+                _sentence(why),
+                f"Allowed: {conflict.allowed}",
+            )
         )
     return found
 
@@ -90,45 +96,68 @@ def _not_computed(checkup: Checkup) -> Iterator[Finding]:
             continue  # `_rim` says so in its own words
         else:
             why = "The press could not be computed, so light was followed through the untouched sensor"
-            yield Finding("error", field, rest.rstrip("."), why, "Change that value, or check a lighter press")
+            yield Finding(
+                "error", field, rest.rstrip("."), why, "Change that value, or check a lighter press"
+            )
 
 
 def _leds(checkup: Checkup) -> Iterator[Finding]:
-    design = checkup.design
-    for number, led in enumerate(design.leds):
-        name = f"leds.{number}"
-        if led.flux_W == 0.0:
-            why = "Its layer of the picture is black"
-            yield Finding("warning", f"{name}.flux_W", "is 0, a failed LED", why, "Set its flux in W")
-            continue
-        seen = checkup.in_sight_percent[number]
-        if seen > 0.0:
+    design, leds = checkup.design, checkup.design.leds
+    lit = [number for number, led in enumerate(leds) if led.flux_W > 0.0]
+    for number in sorted(set(range(len(leds))) - set(lit)):
+        why = "Its layer of the picture is black"
+        yield Finding("warning", f"leds.{number}.flux_W", "is 0, a failed LED", why, "Set its flux in W")
+    seen = [number for number in lit if checkup.in_sight_percent[number] > 0.0]
+    if seen:
+        share = float(checkup.in_sight_percent[seen].sum())
+        yield Finding(
+            "warning",
+            _these(seen, len(leds), ""),
+            f"{share:.2g} % of the pixels look straight into an LED",
+            "Its spot is brighter than any contact and hides what lies there",
+            "Move it behind the edge of the field of view, couple it through air, or narrow the field",
+        )
+    missed = [number for number in lit if checkup.first["missed"][number] > _MISSED]
+    if missed:
+        gaps = max(leds[number].gap_mm for number in missed)
+        yield Finding(
+            "warning",
+            _these(missed, len(leds), ".gap_mm"),
+            f"{_span(checkup.first['missed'][missed])} % of its light never enters the guide",
+            "It is lost and makes stray light in a real housing",
+            f"Bring it nearer than {gaps:g} mm, or nearer to the middle of the side, or embed it",
+        )
+    for coupling, change in (
+        ("embedded", "Couple it through air at a flat side"),
+        ("air", "Put it lower, or raise the guide's index"),
+    ):
+        leaks = [
+            number
+            for number in lit
+            if checkup.first["leaked"][number] > _LEAKED and leds[number].coupling == coupling
+        ]
+        if leaks:
             yield Finding(
                 "warning",
-                name,
-                f"{seen:.2g} % of the pixels look straight into the LED",
-                "Its spot is brighter than any contact and hides what lies there",
-                "Move it behind the edge of the field of view, couple it through air, or narrow the field",
-            )
-        missed, leaked = checkup.first["missed"][number], checkup.first["leaked"][number]
-        if missed > _MISSED:
-            yield Finding(
-                "warning",
-                f"{name}.gap_mm",
-                f"{missed:.0f} % of its light goes by the guide or is mirrored off its side",
-                "It is lost and makes stray light in a real housing",
-                f"Bring the LED nearer than {led.gap_mm:g} mm or nearer to the middle of the side, or embed it",
-            )
-        if leaked > _LEAKED:
-            yield Finding(
-                "warning",
-                f"{name}.coupling",
-                f"{leaked:.0f} % of its light meets the contact surface too steeply to be trapped",
+                _these(leaks, len(leds), ".coupling"),
+                f"{_span(checkup.first['leaked'][leaks])} % of its light meets the contact surface too steeply "
+                "to be trapped",
                 "It shines through without any contact: a bright background near the LED",
-                "Couple it through air at a flat side"
-                if led.coupling == "embedded"
-                else "Lower its place, or raise the guide's index",
+                change,
             )
+
+
+def _these(numbers: Sequence[int], count: int, field: str) -> str:
+    """The field of these LEDs; `leds.*` for all of several."""
+    if len(numbers) == count > 1:
+        return f"leds.*{field}"
+    return ", ".join(f"leds.{number}{field}" for number in numbers)
+
+
+def _span(values: NDArray[np.float64]) -> str:
+    """Lowest to highest, whole numbers."""
+    low, high = f"{values.min():.0f}", f"{values.max():.0f}"
+    return low if low == high else f"{low} to {high}"
 
 
 def _rim(checkup: Checkup) -> Iterator[Finding]:
@@ -140,7 +169,7 @@ def _rim(checkup: Checkup) -> Iterator[Finding]:
             yield Finding(
                 "error",
                 f"leds.{number}.z_mm",
-                f"the LED's upper edge ({top:.2f} mm) lies above the pressed rim ({checkup.rim_mm:.2f} mm at a "
+                f"the LED's upper edge ({top:.2f} mm) lies above the rim ({checkup.rim_mm:.2f} mm under a "
                 f"press of {checkup.indentation_mm:g} mm)",
                 "The rim shades it, and brightness falls with the press instead of the contact",
                 f"Put it at {checkup.rim_mm - led.diameter_mm / 2:.2f} mm or lower",
@@ -188,12 +217,13 @@ def _losses(checkup: Checkup) -> Iterator[Finding]:
     aside = together(checkup.sinks.get("aside", np.zeros(len(design.leds)))) - together(
         checkup.first["missed"]
     )
+    reaches = together(checkup.first["trapped"]) + together(checkup.first["leaked"])
     if aside > _ASIDE and design.waveguide.walls == "polished":
         yield Finding(
             "note",
             "waveguide.walls",
             f"{aside:.0f} % of the light crosses the guide and leaves by its side faces",
-            "Most of it never met the contact: the camera sees little of what the LEDs give",
+            f"Only {reaches:.0f} % ever come to the contact surface, and most of that goes by untouched",
             "White walls (walls = 'diffuse') send it back, at the price of a background that is less trapped",
         )
     frame = together(checkup.sinks.get("frame", np.zeros(len(design.leds))))
@@ -252,13 +282,14 @@ def _exposure(checkup: Checkup) -> Iterator[Finding]:
             "See flux_W of the LEDs",
         )
         return
-    full = shown.saturated_percent
+    which = "standard press" if checkup.standard or checkup.blank else "untouched picture"
+    full = max(shown.saturated_percent - checkup.spots_percent, 0.0)  # spots of LEDs have a line of their own
     top = 2**camera.bits - 1
     if full > SATURATED["warning"]:
         yield Finding(
             "error" if full > SATURATED["error"] else "warning",
             "camera.exposure_ms",
-            f"{full:.2g} % of the pixels are full on the standard press",
+            f"{full:.3g} % of the pixels are full on the {which}",
             "A full pixel cannot show that contact grew",
             f"Set {advised:g} ms (from {camera.exposure_ms:g} ms), or stop down the lens",
         )
@@ -287,7 +318,8 @@ def _signal(checkup: Checkup) -> Iterator[Finding]:
     signal, design = checkup.signal, checkup.design
     if signal is None:
         return
-    what = f"the standard inclusion adds {signal.counts:.1f} counts, {signal.over_noise:.1f} times a pixel's noise"
+    times = f"{signal.over_noise:.1f} times a pixel's noise"
+    what = f"the standard inclusion adds {signal.counts:.1f} counts, {times}"
     longer = "Expose longer, average frames, or press deeper"
     if signal.over_noise < _SEEN:
         yield Finding("error", "signal", what, "One frame cannot show it", longer)
@@ -303,7 +335,8 @@ def _signal(checkup: Checkup) -> Iterator[Finding]:
             "Lower the threshold, or expose longer",
         )
     step = 1.0 / np.sqrt(12.0)
-    if signal.noise_dn < 1.3 * step:
+    saturated = checkup.standard is not None and checkup.standard.saturated_percent > SATURATED["error"]
+    if signal.noise_dn < 1.3 * step and not saturated:
         yield Finding(
             "note",
             "camera.gain_e_per_dn",
@@ -314,7 +347,7 @@ def _signal(checkup: Checkup) -> Iterator[Finding]:
 
 
 def _balance(checkup: Checkup) -> Iterator[Finding]:
-    off: NDArray[np.float64] = np.where(checkup.emitted_W > 0, checkup.closure_percent, 0.0)
+    off = checkup.closure_percent
     worst = float(off[np.abs(off).argmax()])
     if abs(worst) > CLOSURE_PERCENT:
         yield Finding(
