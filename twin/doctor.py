@@ -107,7 +107,7 @@ class Checkup:
     noise_percent: float
     """Monte Carlo noise of the pictures, per cent of their mean (rms)."""
     uniformity: float
-    """Brightest over darkest hundredth of the light in the background picture of a press."""
+    """Brightest over darkest hundredth of the light on plain tissue (untouched where there is no press)."""
     failures: tuple[str, ...] = ()
     """One line for each thing that could not be computed."""
     paths: Paths | None = field(default=None, repr=False)
@@ -322,8 +322,10 @@ def _exposure(design: Design, rendering: Rendering, seed: int) -> Exposure:
     radiance, wavelength = _total(rendering), design.light.wavelength_nm
     mean = mean_counts(design.camera, radiance, wavelength)
     image = expose(design.camera, radiance, wavelength, np.random.default_rng(seed))
-    brightest = min(float(mean.max()), 2.0**design.camera.bits - 1)
-    return Exposure(brightest, float(mean.mean()), saturated_percent(design, image, rendering.radiance))
+    mean = np.minimum(mean, 2**design.camera.bits - 1)
+    return Exposure(
+        float(mean.max()), float(mean.mean()), saturated_percent(design, image, rendering.radiance)
+    )
 
 
 def _advised(design: Design, rendering: Rendering, in_sight: Array) -> float | None:

@@ -102,7 +102,7 @@ def _not_computed(checkup: Checkup) -> Iterator[Finding]:
 
 
 def _leds(checkup: Checkup) -> Iterator[Finding]:
-    design, leds = checkup.design, checkup.design.leds
+    leds = checkup.design.leds
     lit = [number for number, led in enumerate(leds) if led.flux_W > 0.0]
     for number in sorted(set(range(len(leds))) - set(lit)):
         why = "Its layer of the picture is black"
@@ -140,8 +140,8 @@ def _leds(checkup: Checkup) -> Iterator[Finding]:
             yield Finding(
                 "warning",
                 _these(leaks, len(leds), ".coupling"),
-                f"{_span(checkup.first['leaked'][leaks])} % of its light meets the contact surface too steeply "
-                "to be trapped",
+                f"{_span(checkup.first['leaked'][leaks])} % of its light meets the contact surface too "
+                "steeply to be trapped",
                 "It shines through without any contact: a bright background near the LED",
                 change,
             )
@@ -253,8 +253,8 @@ def _picture(checkup: Checkup) -> Iterator[Finding]:
         yield Finding(
             "warning",
             "leds",
-            f"the picture of a press on plain tissue is {checkup.uniformity:.0f} times brighter in one place "
-            "than in another",
+            f"without an inclusion, the picture is {checkup.uniformity:.0f} times brighter in one place than "
+            "in another",
             "Noise and saturation then limit opposite ends of the picture",
             "Spread the LEDs over more sides, or couple them through air",
         )

@@ -16,7 +16,7 @@ from twin.panels import INK
 
 # Fate of a path: colour, and words for the legend. What `scenes.paths` does not name yet is drawn black.
 FATES: dict[str, tuple[str, str]] = {
-    "tissue": ("#d7301f", "enters the tissue where it touches: the signal"),
+    "tissue": ("#d7301f", "enters the tissue (bars: and stays there)"),
     "below": ("#08519c", "leaves below, a little of it into the camera"),
     "aside": ("#9e9e9e", "crosses the guide and leaves by a side face"),
     "missed": ("#d9d9d9", "goes by the guide, or is mirrored off its side"),
@@ -31,9 +31,9 @@ FATES: dict[str, tuple[str, str]] = {
 }
 _FIRST = {
     "missed": ("#d9d9d9", "never enters the guide"),
-    "elsewhere": ("#bdd7e7", "never comes to the contact surface"),
-    "trapped": ("#2b6ca3", "comes to it trapped: only touching lets it out"),
-    "leaked": ("#c51b8a", "comes to it too steeply: leaks"),
+    "elsewhere": ("#bdd7e7", "never reaches the contact surface"),
+    "trapped": ("#2b6ca3", "reaches it trapped: touch lets it out"),
+    "leaked": ("#c51b8a", "reaches it too steeply: leaks"),
 }
 
 
@@ -84,7 +84,13 @@ def draw_first(axes: Axes, checkup: Checkup) -> None:
     axes.set_title("d  What it does first")
     handles = [Rectangle((0, 0), 1, 1, facecolor=colour) for colour, _ in _FIRST.values()]
     words = [text for _, text in _FIRST.values()]
-    style: dict[str, Any] = {"fontsize": 6.5, "frameon": False, "ncols": 2, "handlelength": 1.2}
+    style: dict[str, Any] = {
+        "fontsize": 6.5,
+        "frameon": False,
+        "ncols": 2,
+        "handlelength": 1.2,
+        "columnspacing": 1.0,
+    }
     axes.legend(handles, words, loc="upper left", bbox_to_anchor=(-0.08, -0.17), **style)
 
 
@@ -112,7 +118,7 @@ def write_facts(axes: Axes, checkup: Checkup) -> None:
         f"Into the camera: {checkup.together(checkup.detected):.2g} % of the light.",
         f"Brightest pixel {shown.brightest_dn:.0f} of {top} counts, mean {shown.mean_dn:.0f}; untouched "
         f"{checkup.background.mean_dn:.1f}.",
-        f"Full pixels at {camera.exposure_ms:g} ms: {shown.saturated_percent:.2g} %.",
+        f"Full pixels at {camera.exposure_ms:g} ms: {shown.saturated_percent:.3g} %.",
     ]
     if signal is not None:
         times = f"{signal.over_noise:.0f} times a pixel's noise"

@@ -25,7 +25,7 @@ from twin.lightbars import FATES, draw_bars, draw_first, draw_legend, write_fact
 from twin.panels import FAINT, INK, LED
 from twin.pictures import DPI, HEIGHT_PX, STYLE, WIDTH_PX
 
-_LINES = 80  # in one panel, about
+_LINES = 70  # in one panel, about
 _LEAST = 2  # of every fate that an LED has
 _BELOW_MM, _BESIDE_MM, _TISSUE_MM = 6.0, 6.0, 3.0  # drawn beyond the sensor
 _SIDES = {"x": 0, "y": 1}
@@ -87,8 +87,9 @@ def _draw_paths(axes: Axes, checkup: Checkup, columns: tuple[int, int], leds: li
     assert paths is not None
     each = max(_LINES // max(len(leds), 1), 4)
     lines: dict[str, list[NDArray[np.float32]]] = {}
+    ended = paths.fate != NAMES.index("going")  # what goes round and round would cover all else
     for number in leds:
-        mine = np.flatnonzero(paths.led == number)
+        mine = np.flatnonzero((paths.led == number) & ended)
         for place in mine[chosen(paths.fate[mine], each)]:
             corners = paths.vertices_mm[:, place]
             corners = corners[np.isfinite(corners[:, 0])][:, columns]

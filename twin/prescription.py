@@ -15,7 +15,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from twin.doctor import STANDARD, Checkup, Exposure
-from twin.findings import CLOSURE_PERCENT, RANKS, Finding
+from twin.findings import CLOSURE_PERCENT, RANKS, SATURATED, Finding
 from twin.frame import versions
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ RECORD, PICTURE = "check.json", "check.png"
 
 FIRST_IN_WORDS = {
     "missed": "never enters the guide",
-    "elsewhere": "never comes to the contact surface",
+    "elsewhere": "never comes to the contact",
     "trapped": "comes to it, trapped",
     "leaked": "comes to it too steeply: leaks",
 }
@@ -207,12 +207,14 @@ def _exposures(checkup: Checkup) -> Table:
 def _signal(checkup: Checkup) -> str:
     lines = []
     if checkup.signal is not None:
-        signal = checkup.signal
+        signal, shown = checkup.signal, checkup.standard
+        over = shown is not None and shown.saturated_percent > SATURATED["error"] + checkup.spots_percent
+        full = ", but pixels are full: not to be trusted" if over else ""
         what = f"{STANDARD.size:g} mm, {STANDARD.depth:g} mm deep, {STANDARD.modulus:g} kPa"
         lines.append(
             f"[bold]signal[/bold]: the standard inclusion ({what}) adds {signal.counts:.1f} counts "
             f"(tared, 3 x 3 mean); a pixel's noise there is {signal.noise_dn:.2f} in one frame; "
-            f"signal over noise {signal.over_noise:.0f}"
+            f"signal over noise {signal.over_noise:.0f}{full}"
         )
     if checkup.advised_exposure_ms is not None:
         lines.append(
