@@ -1,4 +1,4 @@
-"""The picture without shortcuts: every ray from the LEDs is followed, and seen by the camera wherever it lands.
+"""The picture without shortcuts: rays from the LEDs, seen by the camera wherever they land.
 
 No light is gathered, no angle tabulated apart, nothing smoothed: slower than `transport`, and what that is
 measured against. The camera's view of a point of the surface is the closed form of `view`.
@@ -37,7 +37,7 @@ class Film:
     Attributes
     ----------
     film : (_MAP, _MAP, 2)
-        Column and row (x.5 are pixels' middles) of the point at node [iy, ix] of a grid over the guide's face.
+        Column and row (x.5 are pixels' middles) of the node [iy, ix] of a grid over the guide's face.
     lean : (_MAP, _MAP, 2)
         Run in x and y per mm of height of the camera's ray through it.
     area_mm2 : (rows, columns)
@@ -68,7 +68,7 @@ class Film:
 
 
 def _look_up(values: Array, film: Array) -> Array:
-    """Values (rows, columns, 2) at film coordinates (..., 2) of pixels' middles, continued in a straight line."""
+    """Values (rows, columns, 2) at film coordinates (..., 2) of pixels' middles, straight on beyond."""
     rows, columns = values.shape[:2]
     inside = np.clip(film, 0.0, [columns - 1.0, rows - 1.0])
     index = np.moveaxis(inside[..., ::-1], -1, 0)
