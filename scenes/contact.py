@@ -95,7 +95,7 @@ def contact_optics(
     apart = _mean_over_gaps(n_guide, n_gap, n_tissue, gaps, cosine, wavelength_nm)
     table = fraction[:, None] * touching + (1.0 - fraction[:, None]) * apart
 
-    hemispherical = 2.0 * table @ _moment_weights(cosine)
+    hemispherical = 2.0 * table @ moment_weights(cosine)
     inside = (n_guide / n_tissue) ** 2 * hemispherical
     gain = (n_guide / n_tissue) ** 2 * albedo / (1.0 - albedo * (1.0 - inside))
     return ContactOptics(table, hemispherical, gain)
@@ -171,7 +171,7 @@ def _quarter_turn(half_count: int = 30, reach: float = 3.2) -> tuple[Array, Arra
     return 0.25 * np.pi * (1.0 + np.tanh(u)), 0.5 * np.pi * weight
 
 
-def _moment_weights(cosine: Array) -> Array:
+def moment_weights(cosine: Array) -> Array:
     """Weights w: sum(w f) = ∫ f(x) x dx over 0..1, exact for f piecewise linear on the uniform nodes."""
     step = cosine[1] - cosine[0]
     weights = step * cosine
