@@ -11,7 +11,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import bsdf, pinhole, surface
+from . import bsdf  # noqa: F401  registers the BSDF
+from . import pinhole, surface
 from .contact import ContactOptics, contact_fraction, contact_optics
 from .sensor import Led, Sensor
 
@@ -33,8 +34,8 @@ def optics_of(sensor: Sensor) -> ContactOptics:
     )
 
 
-def load_scene(sensor: Sensor, optics: ContactOptics) -> mi.Scene:
-    """Load the sensor with a flat, unloaded contact surface.
+def load_scene(sensor: Sensor, table: mi.TensorXf) -> mi.Scene:
+    """Load the sensor with a flat, unloaded contact surface whose optics are `table` (`bsdf.Table.pack`).
 
     The contact surface is the mesh with id `contact`; LED number i is the shape with id `led_i`. Media are
     separated by single faces: guide to air (side walls), guide to glass, glass to air. The glass's rim is
@@ -48,7 +49,7 @@ def load_scene(sensor: Sensor, optics: ContactOptics) -> mi.Scene:
     scene: dict[str, Any] = {
         "type": "scene",
         "camera": pinhole.describe(sensor),
-        "contact": _contact_mesh(sensor, optics),
+        "contact": _contact_mesh(sensor, table),
         "guide_to_glass": _face(half, bottom, _dielectric(guide.refractive_index, glass.refractive_index)),
         "glass_to_air": _face(half, lowest, _dielectric(glass.refractive_index, 1.0)),
     }
@@ -104,14 +105,14 @@ def led_frame(led: Led, half_mm: float) -> tuple[np.ndarray, np.ndarray, np.ndar
     return centre, -outward, tangent
 
 
-def _contact_mesh(sensor: Sensor, optics: ContactOptics) -> mi.Mesh:
+def _contact_mesh(sensor: Sensor, table: mi.TensorXf) -> mi.Mesh:
     start = surface.flat(sensor.guide.width_mm, 0.0)
     shape = surface.triangulate(start)
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict(
         {
             "type": "frustrated_tir",
-            "table": bsdf.Table.pack(optics),
+            "table": table,
             "contact_fraction": {"type": "mesh_attribute", "name": "vertex_contact_fraction"},
         }
     )

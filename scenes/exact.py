@@ -183,11 +183,12 @@ def exact(
         through = table.transmittance(a, cosine, touches)
         if local:
             # what leaves towards the camera is known before it is drawn
-            glow = throughput * through * table.diffuse_gain(a, touches) * dr.inv_pi
+            glow = throughput * through * dr.inv_pi
             for view in views:
                 down = view.towards(si.p)
                 off = dr.dot(si.sh_frame.n, down)
-                seen = table.transmittance(a, off * dr.rcp(dr.norm(down)), touches)
+                off_unit = off * dr.rcp(dr.norm(down))
+                seen = table.transmittance(a, off_unit, touches) * table.diffuse(a, cosine, off_unit, touches)
                 view.add(number, si.p, glow * seen * dr.dot(si.n, down), touches & (off > 0.0))
             scattered, weight = si.bsdf(ray).sample(context, si, u1, u2, touches)
             direction = dr.select(touches, scattered.wo, direction)

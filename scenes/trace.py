@@ -19,6 +19,7 @@ from .bsdf import Table
 from .build import led_frame
 from .irradiance import AngularBasis, look_up, weigh
 from .sensor import Sensor
+from .tissue import Coupling
 
 Array = NDArray[np.float64]
 
@@ -182,12 +183,18 @@ def emit(sensor: Sensor, number: mi.UInt32, u: list[mi.Float]) -> mi.Ray3f:
 
 
 def re_emit(
-    scene: mi.Scene, sensor: Sensor, table: Table, upward: Array, number: mi.UInt32, u: list[mi.Float]
+    scene: mi.Scene,
+    sensor: Sensor,
+    table: Table,
+    coupling: Coupling,
+    upward: Array,
+    number: mi.UInt32,
+    u: list[mi.Float],
 ) -> tuple[mi.Ray3f, mi.Float]:
     """Rays from the contact surface as the tissue re-emits light, and what each carries, times their number.
 
-    Even over the guide's face, directions as in the lobe L = (n1/n3)² T(cos) U / pi; `upward` is U
-    (n_led, m, m), W/mm², on cells [iy, ix] of the guide's face.
+    Even over the guide's face, directions as T(cos) cos, weight as L = (n1/n3)² T(cos) sum phi_i(cos) V_i / pi;
+    `upward` is V (n_led, modes, m, m), W/mm², on cells [iy, ix] of the guide's face.
     """
     width = sensor.guide.width_mm
     x, y = (u[0] - 0.5) * width, (u[1] - 0.5) * width
@@ -196,16 +203,19 @@ def re_emit(
     contact = next(shape for shape in scene.shapes() if shape.id() == "contact")
     meets = si.is_valid() & (si.shape == mi.ShapePtr(contact))
     fraction = dr.select(meets, contact.eval_attribute_1("vertex_contact_fraction", si, meets), 0.0)
-    brightness = mi.Float(0.0)
-    for led, amount in enumerate(look_up(upward, u[0], u[1])):
-        brightness = dr.select(number == led, amount, brightness)
+    n_led, modes = upward.shape[:2]
+    layers = look_up(upward.reshape(n_led * modes, *upward.shape[2:]), u[0], u[1])
 
     # which of the table's two rows to draw from needs no even spread: any digits of the place will do
     digits = u[0] * 4096.0
     direction = table.draw(fraction, digits - dr.floor(digits), mi.Point2f(u[2], u[3]), meets)
     cosine = mi.Frame3f.cos_theta(direction)
-    squeezed = (sensor.guide.refractive_index / sensor.tissue.refractive_index) ** 2 * width**2
-    lobe = squeezed * table.transmittance(fraction, cosine, meets) * cosine * dr.inv_pi
+    lobes = table.lobes(cosine, meets)
+    brightness = mi.Float(0.0)
+    for led in range(n_led):
+        here = sum(lobe * layers[led * modes + i] for i, lobe in enumerate(lobes))
+        brightness = dr.select(number == led, here, brightness)
+    lobe = coupling.scale * width**2 * table.transmittance(fraction, cosine, meets) * cosine * dr.inv_pi
     brightness *= lobe / table.density(fraction, cosine, meets)
     return si.spawn_ray(si.to_world(direction)), dr.select(meets, dr.maximum(brightness, 0.0), 0.0)
 

@@ -8,7 +8,6 @@ Import only after a variant is set (`scenes.backend.use`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Protocol
 
 import drjit as dr
@@ -16,8 +15,7 @@ import mitsuba as mi
 
 from .bsdf import Table
 from .sensor import Sensor
-
-_LEAST_WEIGHT = 0.1  # below it, Russian roulette
+from .walk import Body, Medium, roam
 
 
 class View(Protocol):
@@ -30,41 +28,15 @@ class View(Protocol):
         """Count an amount that leaves at a point."""
 
 
-@dataclass(frozen=True)
-class _Tissue:
-    """Tissue as a volume that scatters, below a surface that is flat over the width of a light spot."""
-
-    scattering: float  # 1/mm
-    absorption: float
-    anisotropy: float
-    index: float  # of the guide over the tissue's
-
-    @staticmethod
-    def of(sensor: Sensor) -> _Tissue:
-        tissue = sensor.tissue
-        return _Tissue(
-            tissue.scattering_per_mm / (1.0 - tissue.anisotropy),
-            tissue.absorption_per_mm,
-            tissue.anisotropy,
-            sensor.guide.refractive_index / tissue.refractive_index,
-        )
-
-    def phase(self, cosine: mi.Float) -> mi.Float:
-        """Henyey and Greenstein's phase function (1941; key henyey1941), 1/sr."""
-        g = self.anisotropy
-        bend = 1.0 + g * g - 2.0 * g * cosine
-        return (1.0 - g * g) * dr.inv_four_pi * dr.rsqrt(bend) / bend
-
-    def turn(self, direction: mi.Vector3f, u: mi.Point2f) -> mi.Vector3f:
-        """A direction after scattering."""
-        g = self.anisotropy
-        if abs(g) < 1e-3:
-            return mi.warp.square_to_uniform_sphere(u)
-        inner = (1.0 - g * g) / (1.0 - g + 2.0 * g * u.x)
-        cosine = dr.clip((1.0 + g * g - inner * inner) / (2.0 * g), -1.0, 1.0)
-        sine = dr.safe_sqrt(1.0 - cosine * cosine)
-        s, c = dr.sincos(dr.two_pi * u.y)
-        return mi.Frame3f(direction).to_world(mi.Vector3f(sine * c, sine * s, cosine))
+def body_of(sensor: Sensor) -> Body:
+    """What light enters: the tissue, or the contact sheet before it."""
+    skin, tissue = sensor.skin, sensor.tissue
+    g = tissue.anisotropy
+    if skin.sheet is None:
+        return Body(Medium(tissue.scattering_per_mm / (1.0 - g), tissue.absorption_per_mm, g))
+    sheet = skin.sheet
+    medium = Medium(sheet.scattering_per_mm, sheet.absorption_per_mm)
+    return Body(medium, sheet.thickness_mm, sheet.backing)
 
 
 def wander(
@@ -78,63 +50,60 @@ def wander(
     enters: mi.Bool,
     random: mi.PCG32,
 ) -> tuple[mi.Ray3f, mi.Float, mi.PCG32]:
-    """Follow light that enters at `si` until it leaves, and show it to the views at every scattering.
+    """Follow light that enters at `si` until it leaves, and show it to the views at every collision.
 
     Returns
     -------
     The ray that leaves (in the guide, from the plane through `si`), the share of the light that it carries,
     0 where all is absorbed, and the state of the random numbers.
     """
-    tissue, frame, width = _Tissue.of(sensor), si.sh_frame, sensor.guide.width_mm
-    extinction = tissue.scattering + tissue.absorption
-    albedo = tissue.scattering / extinction
+    body, width = body_of(sensor), sensor.guide.width_mm
+    index = sensor.guide.refractive_index / behind(sensor)
+    frame = si.sh_frame
 
-    def fraction_at(point: mi.Point3f, active: mi.Bool) -> mi.Float:
-        return spots.eval(mi.Point2f(point.x / width + 0.5, point.y / width + 0.5), active)[0]
+    def world(place: mi.Point3f) -> mi.Point3f:
+        return si.p + frame.to_world(mi.Vector3f(place.x, place.y, -place.z))
 
-    def going(place, way, share, inside, random):  # type: ignore[no-untyped-def]
-        return inside
+    def fraction_at(point: mi.Point3f) -> mi.Float:
+        return spots.eval(mi.Point2f(point.x / width + 0.5, point.y / width + 0.5))[0]
 
-    def step(place, way, share, inside, random):  # type: ignore[no-untyped-def]
-        free = -dr.log(1.0 - random.next_float32()) / extinction
-        rise = dr.select(way.z > 0.0, -place.z / dr.maximum(way.z, 1e-9), dr.inf)
-        surfaces = inside & (rise < free)
-        place = place + way * dr.minimum(free, rise)
-        place.z = dr.select(surfaces, 0.0, dr.minimum(place.z, 0.0))
+    def passing(where: mi.Point3f, cosine: mi.Float) -> mi.Float:
+        square = 1.0 - (1.0 - dr.square(cosine)) / index**2
+        through = table.transmittance(fraction_at(world(where)), dr.safe_sqrt(square))
+        return dr.select(square > 0.0, through, 0.0)
 
-        # at the surface: out through the contact, or mirrored
-        a = fraction_at(si.p + frame.to_world(place), surfaces)
-        flat = mi.Vector2f(way.x, way.y) / tissue.index
-        steep = 1.0 - dr.squared_norm(flat)
-        escape = dr.select(steep > 0.0, table.transmittance(a, dr.safe_sqrt(steep), surfaces), 0.0)
-        leaves = surfaces & (random.next_float32() < escape)
-        # in the volume: seen by the views, then on in another direction
-        scatters = inside & ~surfaces
-        share = dr.select(scatters, share * albedo, share)
+    def witness(
+        where: mi.Point3f, way: mi.Vector3f, share: mi.Float, g: mi.Float, collides: mi.Bool
+    ) -> None:
         for view in views:
-            down = view.towards(si.p + frame.to_world(place))
+            down = view.towards(world(where))
             length = dr.norm(down)
             out = frame.to_local(down) / length
-            inner = mi.Vector2f(out.x, out.y) * tissue.index
-            up = dr.safe_sqrt(1.0 - dr.squared_norm(inner))
-            aim = mi.Vector3f(inner.x, inner.y, up)
-            run = -place.z / up
-            exit = si.p + frame.to_world(place + aim * run)
-            seen = table.transmittance(fraction_at(exit, scatters), out.z, scatters) * out.z * length
-            amount = throughput * share * tissue.phase(dr.dot(way, aim)) * dr.exp(-extinction * run) / up
-            view.add(number, exit, amount * seen, scatters & (out.z > 0.0) & (up > 0.0))
-        turned = tissue.turn(way, mi.Point2f(random.next_float32(), random.next_float32()))
-        mirrored = mi.Vector3f(way.x, way.y, -way.z)
-        way = dr.select(scatters, turned, dr.select(surfaces & ~leaves, mirrored, way))
-        weak = scatters & (share < _LEAST_WEIGHT)
-        stays = random.next_float32() < _LEAST_WEIGHT
-        share = dr.select(weak, dr.select(stays, share / _LEAST_WEIGHT, 0.0), share)
-        return place, way, share, inside & ~leaves & (share > 0.0), random
+            aim_x, aim_y = out.x * index, out.y * index
+            up = dr.safe_sqrt(1.0 - dr.square(aim_x) - dr.square(aim_y))
+            run = where.z / dr.maximum(up, 1e-6)
+            leaves = world(where + run * mi.Vector3f(aim_x, aim_y, -up))
+            seen = table.transmittance(fraction_at(leaves), out.z, collides) * out.z * length
+            bend = phase(g, dr.dot(way, mi.Vector3f(aim_x, aim_y, -up)))
+            amount = throughput * share * bend * dr.exp(-body.medium.extinction_per_mm * run) / up
+            view.add(number, leaves, amount * seen, collides & (out.z > 0.0) & (up > 0.0))
 
-    flat = -mi.Vector2f(si.wi.x, si.wi.y) * tissue.index
-    way = mi.Vector3f(flat.x, flat.y, -dr.safe_sqrt(1.0 - dr.squared_norm(flat)))
-    state = (dr.zeros(mi.Point3f), way, dr.select(enters, mi.Float(1.0), 0.0), enters, random)
-    place, way, share, _, random = dr.while_loop(state, going, step)
-    flat = mi.Vector2f(way.x, way.y) / tissue.index
+    flat = -mi.Vector2f(si.wi.x, si.wi.y) * index
+    way = mi.Vector3f(flat.x, flat.y, dr.safe_sqrt(1.0 - dr.squared_norm(flat)))
+    start = dr.zeros(mi.Point3f, dr.width(number))
+    where, way, share, _, random = roam(body, start, way, random, passing, enters, witness)
+    flat = mi.Vector2f(way.x, way.y) / index
     out = mi.Vector3f(flat.x, flat.y, dr.safe_sqrt(1.0 - dr.squared_norm(flat)))
-    return mi.Ray3f(si.p + frame.to_world(place), frame.to_world(out)), share, random
+    return mi.Ray3f(world(where), frame.to_world(out)), share, random
+
+
+def behind(sensor: Sensor) -> float:
+    """Refractive index of what light enters."""
+    sheet = sensor.skin.sheet
+    return sensor.tissue.refractive_index if sheet is None else sheet.refractive_index
+
+
+def phase(g: mi.Float, cosine: mi.Float) -> mi.Float:
+    """Henyey and Greenstein's phase function (1941; key henyey1941), 1/sr."""
+    bend = 1.0 + g * g - 2.0 * g * cosine
+    return (1.0 - g * g) * dr.inv_four_pi * dr.rsqrt(bend) / bend
