@@ -233,9 +233,7 @@ class FrustratedTIR(mi.BSDF):
             return self.table.density(a, cosine, active)
         return dr.maximum(cosine, 0.0) * dr.inv_pi
 
-    def _at(
-        self, si: mi.SurfaceInteraction3f, cos_i: mi.Float, active: mi.Bool
-    ) -> tuple[mi.Float, mi.Float]:
+    def _at(self, si: mi.SurfaceInteraction3f, cos_i: mi.Float, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
         a = self.fraction.eval_1(si, active)
         a = dr.select(dr.isfinite(a), a, 0.0)  # slivers at a pressed-back rim have no barycentric coordinates
         return a, self.table.transmittance(a, cos_i, active)
@@ -247,7 +245,9 @@ class FrustratedTIR(mi.BSDF):
 
     def _typical(self, a: mi.Float, cos_i: mi.Float, active: mi.Bool) -> mi.Float:
         """About the share of the light that passed that comes back: it only decides how often to follow it."""
-        return dr.maximum(self.table.diffuse(a, cos_i, cos_i, active), 1e-3) * self.table.hemispherical(a, active)
+        return dr.maximum(self.table.diffuse(a, cos_i, cos_i, active), 1e-3) * self.table.hemispherical(
+            a, active
+        )
 
     def to_string(self) -> str:
         return f"FrustratedTIR[table = {self.table.rows} x {self.table.columns}]"

@@ -11,10 +11,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import bsdf  # noqa: F401  registers the BSDF
-from . import pinhole, surface
-from .contact import ContactOptics, contact_fraction, contact_optics
+from . import (
+    bsdf,  # noqa: F401  registers the BSDF
+    pinhole,
+    surface,
+)
+from .contact import ContactOptics, contact_optics, real_contact
 from .sensor import Led, Sensor
+from .tissue import body_behind
 
 _BLACK = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.0}}}
 _OUTWARD = {"+x": (1.0, 0.0), "-x": (-1.0, 0.0), "+y": (0.0, 1.0), "-y": (0.0, -1.0)}
@@ -23,14 +27,16 @@ _WALL_TOP_MM = 0.5  # walls reach above the contact surface, which bulges a litt
 
 def optics_of(sensor: Sensor) -> ContactOptics:
     """The table of the contact's optics for this sensor."""
-    skin, tissue = sensor.skin, sensor.tissue
+    skin = sensor.skin
+    index, body = body_behind(skin, sensor.tissue)
     return contact_optics(
         sensor.guide.refractive_index,
         skin.gap_index,
-        tissue.refractive_index,
-        tissue.albedo,
+        index,
+        body.reflectance,
         skin.rms_height_um,
         sensor.wavelength_nm,
+        dust=skin.dust,
     )
 
 
@@ -127,10 +133,7 @@ def _contact_mesh(sensor: Sensor, table: mi.TensorXf) -> mi.Mesh:
 
 
 def _fraction(sensor: Sensor, deformed: surface.OpticalSurface) -> np.ndarray:
-    skin = sensor.skin
-    fraction = contact_fraction(
-        deformed.pressure_kPa, sensor.effective_modulus_kPa, skin.rms_slope, skin.kappa
-    )
+    fraction = real_contact(deformed.pressure_kPa, sensor.skin, sensor.effective_modulus_kPa)
     return surface.with_skirt(fraction)
 
 

@@ -15,6 +15,7 @@ free path, and are taken as local. W(A_r) is what the face throws back into the 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 from .contact import ContactOptics, moment_weights
 from .ftir import gap_transmittance
 from .radial import Kernel, kernel
+from .sensor import Skin, Tissue
 from .slab import Slab, cosines, decay_rate
 
 Array = NDArray[np.float64]
@@ -136,13 +138,25 @@ def tissue_optics(
     root = np.sqrt(even)
     values, vectors = np.linalg.eigh(0.5 * (rest + rest.T) * np.outer(root, root))
     order = np.argsort(-np.abs(values))[: modes - 1]
-    strengths, lobes = [total], [shape]
+    strengths, modes_of = [total], [shape]
     for number in order:
         on_nodes = vectors[:, number] / root
         extended = (at_grid - total * np.outer(shape, plane)) @ (even * on_nodes) / values[number]
         strengths.append(values[number])
-        lobes.append(extended * np.sign(extended[1]))
-    return TissueOptics(transport, body, curve, np.array(strengths), np.stack(lobes))
+        modes_of.append(extended * np.sign(extended[1]))
+    return TissueOptics(transport, body, curve, np.array(strengths), np.stack(modes_of))
+
+
+@lru_cache(maxsize=16)
+def body_behind(skin: Skin, tissue: Tissue) -> tuple[float, TissueOptics]:
+    """Refractive index and optics of what the light enters: the contact sheet if there is one, or the tissue."""
+    sheet = skin.sheet
+    if sheet is None:
+        return tissue.refractive_index, tissue_optics(tissue.scattering_per_mm, tissue.absorption_per_mm)
+    optics = tissue_optics(
+        sheet.scattering_per_mm, sheet.absorption_per_mm, sheet.thickness_mm, sheet.backing
+    )
+    return sheet.refractive_index, optics
 
 
 def couple(optics: ContactOptics, tissue: TissueOptics, n_guide: float, n_tissue: float) -> Coupling:

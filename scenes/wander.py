@@ -72,9 +72,7 @@ def wander(
         through = table.transmittance(fraction_at(world(where)), dr.safe_sqrt(square))
         return dr.select(square > 0.0, through, 0.0)
 
-    def witness(
-        where: mi.Point3f, way: mi.Vector3f, share: mi.Float, g: mi.Float, collides: mi.Bool
-    ) -> None:
+    def witness(where: mi.Point3f, way: mi.Vector3f, share: mi.Float, g: mi.Float, collides: mi.Bool) -> None:
         for view in views:
             down = view.towards(world(where))
             length = dr.norm(down)
