@@ -15,7 +15,7 @@ def of(body: Slab) -> Kernel:
 
 
 def test_known_pairs_come_back() -> None:
-    """exp(-b r)/(2π r) <-> 1/sqrt(k² + b²), b² K0(b r) .. <-> 1/(k² + b²), at rates that the tail does not have."""
+    """exp(-b r)/(2π r) <-> 1/sqrt(k² + b²), K0(b r)/2π <-> 1/(k² + b²), at rates other than the tail's."""
     mixed = kernel(lambda k: 1 / np.sqrt(k**2 + 0.3**2) + 2 / (k**2 + 0.5**2), 1.0, 0.3, 1.0)
     r = np.array([0.01, 0.1, 1.0, 5.0, 20.0])  # the taper shows where the profile has fallen by exp(-6)
     exact = np.exp(-0.3 * r) / (2 * np.pi * r) + 2 * k0(0.5 * r) / (2 * np.pi)
@@ -68,7 +68,9 @@ def test_far_cells_are_the_profile_times_the_area() -> None:
     curve, step = of(Slab(0.98)), 0.1
     cells = curve.cells(step, 120)
     for i, j in ((8, 0), (11, 5), (13, 0), (12, 3), (30, 40), (100, 0)):
-        assert cells[i, j] / step**2 == pytest.approx(curve.profile(np.array([step * np.hypot(i, j)]))[0], rel=4e-3)
+        assert cells[i, j] / step**2 == pytest.approx(
+            curve.profile(np.array([step * np.hypot(i, j)]))[0], rel=4e-3
+        )
 
 
 def test_small_body_in_a_large_cell_stays_there() -> None:
