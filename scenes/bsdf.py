@@ -139,8 +139,9 @@ def _cell(x: mi.Float, nodes: int) -> tuple[mi.UInt32, mi.Float]:
 
 
 class FrustratedTIR(mi.BSDF):
-    """Mirror reflection 1 - T and a diffuse lobe T(cos_i) T(cos_o) K(cos_i, cos_o) / pi; reciprocal, and black
-    from behind.
+    """Mirror reflection 1 - T and a diffuse lobe T(cos_i) T(cos_o) K(cos_i, cos_o) / pi.
+
+    Reciprocal, and black from behind.
 
     Properties: `table` (from `Table.pack`), `contact_fraction` (a texture, real contact fraction 0..1). The
     side that the surface normal points to is the guide.
@@ -244,10 +245,9 @@ class FrustratedTIR(mi.BSDF):
         return dr.maximum(value, 0.0) * cos_o * dr.inv_pi
 
     def _typical(self, a: mi.Float, cos_i: mi.Float, active: mi.Bool) -> mi.Float:
-        """About the share of the light that passed that comes back: it only decides how often to follow it."""
-        return dr.maximum(self.table.diffuse(a, cos_i, cos_i, active), 1e-3) * self.table.hemispherical(
-            a, active
-        )
+        """About what comes back of the light that passed: it only decides how often to follow it."""
+        back = dr.maximum(self.table.diffuse(a, cos_i, cos_i, active), 1e-3)
+        return back * self.table.hemispherical(a, active)
 
     def to_string(self) -> str:
         return f"FrustratedTIR[table = {self.table.rows} x {self.table.columns}]"

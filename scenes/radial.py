@@ -26,8 +26,9 @@ _NEAR_CELLS = 12  # within this many cells a kernel is spread by rings, beyond b
 class Kernel:
     """An even, rotationally symmetric kernel R(r), given by its transform R^(k) = ∫ R J0(kr) 2πr dr.
 
-    At large k the transform falls as c1/k + c2/k², so that the kernel rises as 1/r in the middle. Both parts
-    are split off, c1/sqrt(k² + b²) and c2/(k² + b²), whose profiles are known; the rest is a Chebyshev series.
+    At large k the transform falls as c1/k + c2/k², so that the kernel rises as 1/r in the middle. Both
+    parts are split off, c1/sqrt(k² + b²) and c2/(k² + b²), whose profiles are known; the rest is a
+    Chebyshev series.
 
     Attributes
     ----------
@@ -79,8 +80,8 @@ class Kernel:
         """Share (count, count) of a cell's light that comes back in the cell i, j cells away, both from 0.
 
         Averaged over both cells exactly: over the offset it is the integral of R times two tents of width
-        2 `step`. Near the middle, where R rises as 1/r, rings of the kernel are dealt out to the cells by these
-        tents, so that no light is lost; beyond, R is smooth in a cell.
+        2 `step`. Near the middle, where R rises as 1/r, rings of the kernel are dealt out to the cells by
+        these tents, so that no light is lost; beyond, R is smooth in a cell.
         """
         reach = _NEAR_CELLS * step
         far = step * np.hypot(*np.meshgrid(np.arange(count), np.arange(count)))

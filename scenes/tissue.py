@@ -5,11 +5,11 @@ step. Light comes in and goes out spread over angles; the reflectance is written
 
     L_up(x, µ) = Σ_i φ_i(µ) V_i(x) / π,    V_i = ρ_i R_i (*) [E_i + Σ_j W_ij V_j],
 
-with µ the cosine in the tissue and E_i = ∫ φ_i T L dω the weighted irradiance that enters. Mode 0 is all that
-forgets its direction: φ_0(µ) is the plane albedo over the total reflectance ρ_0, so that the total is right for
-every angle, and R_0 spreads light over about a millimetre. The others are what single and double scattering
-remember (grazing light leaves at grazing angles): they have no net flux, return within a fraction of a mean
-free path, and are taken as local. W(A_r) is what the face throws back into the tissue.
+with µ the cosine in the tissue and E_i = ∫ φ_i T L dω the weighted irradiance that enters. Mode 0 is all
+that forgets its direction: φ_0(µ) is the plane albedo over the total reflectance ρ_0, so that the total is
+right for every angle, and R_0 spreads light over about a millimetre. The others are what single and double
+scattering remember (grazing light leaves at grazing angles): they have no net flux, return within a fraction
+of a mean free path, and are taken as local. W(A_r) is what the face throws back into the tissue.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from .contact import ContactOptics, moment_weights
 from .ftir import gap_transmittance
 from .radial import Kernel, kernel
-from .sensor import Skin, Tissue
+from .skin import Skin, Tissue
 from .slab import Slab, cosines, decay_rate
 
 Array = NDArray[np.float64]
@@ -149,7 +149,7 @@ def tissue_optics(
 
 @lru_cache(maxsize=16)
 def body_behind(skin: Skin, tissue: Tissue) -> tuple[float, TissueOptics]:
-    """Refractive index and optics of what the light enters: the contact sheet if there is one, or the tissue."""
+    """Refractive index and optics of what the light enters: the contact sheet, or without one the tissue."""
     sheet = skin.sheet
     if sheet is None:
         return tissue.refractive_index, tissue_optics(tissue.scattering_per_mm, tissue.absorption_per_mm)
@@ -176,7 +176,7 @@ def couple(optics: ContactOptics, tissue: TissueOptics, n_guide: float, n_tissue
 
 
 def _passed_by_bare_skin(tissue: TissueOptics, n_tissue: float) -> Array:
-    """⟨φ_i φ_j T⟩ of a face to air, (modes, modes): T is nothing beyond the critical angle, so start there."""
+    """⟨φ_i φ_j T⟩ of a face to air, (modes, modes); T starts at the critical angle."""
     critical = np.sqrt(1.0 - 1.0 / n_tissue**2)
     x, w = np.polynomial.legendre.leggauss(200)
     inner = 0.5 * (1.0 + x)

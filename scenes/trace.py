@@ -193,7 +193,7 @@ def re_emit(
 ) -> tuple[mi.Ray3f, mi.Float]:
     """Rays from the contact surface as the tissue re-emits light, and what each carries, times their number.
 
-    Even over the guide's face, directions as T(cos) cos, weight as L = (n1/n3)² T(cos) sum phi_i(cos) V_i / pi;
+    Even over the guide's face, directions as T(cos) cos, weight as L = (n1/n3)² T sum phi_i(cos) V_i / pi;
     `upward` is V (n_led, modes, m, m), W/mm², on cells [iy, ix] of the guide's face.
     """
     width = sensor.guide.width_mm

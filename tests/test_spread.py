@@ -50,7 +50,7 @@ def test_tissue_of_short_paths_is_local_everywhere() -> None:
 
 
 def test_solution_solves_the_equation() -> None:
-    """V_0 = R (*) [E_0 + Σ W_0j V_j], with R summed over cells in plain loops; cells of an eighth of a path."""
+    """V_0 = R (*) [E_0 + Σ W_0j V_j], with R summed over cells in plain loops; cells an eighth of a path."""
     _, tissue, coupling, spread = setting(0.25, 0.05, cells=60)
     fraction = patchy(60)
     entering = np.random.default_rng(1).random((1, 2, 60, 60))
@@ -96,7 +96,7 @@ def test_light_from_here_seen_there_is_light_from_there_seen_here() -> None:
 
 
 def test_no_more_leaves_than_enters_and_all_of_it_if_the_tissue_is_white() -> None:
-    """Flux down less flux up, summed over face and bare skin, is what the tissue absorbs: nothing if white."""
+    """Flux up less flux thrown back is what leaves: all that enters if the tissue is white."""
     _, _, coupling, spread = setting(20.0, 0.0)
     fraction = np.full((100, 100), 64 / 128)
     entering = np.zeros((1, 2, 100, 100))

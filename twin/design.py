@@ -22,20 +22,8 @@ from pydantic.json_schema import GenerateJsonSchema
 
 import fem
 from fem.model import DomeRadius, Length, Modulus, Offset, Poisson, Sides, Tilt
-from scenes.sensor import (
-    Absorption,
-    Anisotropy,
-    Camera,
-    Glass,
-    Guide,
-    Led,
-    RefractiveIndex,
-    Scattering,
-    Sensor,
-    Skin,
-    Tissue,
-    Walls,
-)
+from scenes.sensor import Camera, Glass, Guide, Led, Sensor, Walls
+from scenes.skin import Absorption, Anisotropy, RefractiveIndex, Scattering, Skin, Tissue
 from twin.complaint import DesignError, from_validation, not_finite, shown
 from twin.conflicts import design_conflicts, inclusion_conflicts
 
