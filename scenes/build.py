@@ -11,9 +11,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import bsdf, pinhole, surface
-from .contact import ContactOptics, contact_fraction, contact_optics
+from . import (
+    bsdf,  # noqa: F401  registers the BSDF
+    pinhole,
+    surface,
+)
+from .contact import ContactOptics, contact_optics, real_contact
 from .sensor import Led, Sensor
+from .tissue import body_behind
 
 _BLACK = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.0}}}
 _OUTWARD = {"+x": (1.0, 0.0), "-x": (-1.0, 0.0), "+y": (0.0, 1.0), "-y": (0.0, -1.0)}
@@ -22,26 +27,28 @@ _WALL_TOP_MM = 0.5  # walls reach above the contact surface, which bulges a litt
 
 def optics_of(sensor: Sensor) -> ContactOptics:
     """The table of the contact's optics for this sensor."""
-    skin, tissue = sensor.skin, sensor.tissue
+    skin = sensor.skin
+    index, body = body_behind(skin, sensor.tissue)
     return contact_optics(
         sensor.guide.refractive_index,
         skin.gap_index,
-        tissue.refractive_index,
-        tissue.albedo,
+        index,
+        body.reflectance,
         skin.rms_height_um,
         sensor.wavelength_nm,
+        dust=skin.dust,
     )
 
 
-def load_scene(sensor: Sensor, optics: ContactOptics) -> mi.Scene:
-    """Load the sensor with a flat, unloaded contact surface.
+def load_scene(sensor: Sensor, table: mi.TensorXf) -> mi.Scene:
+    """Load the sensor with a flat, unloaded contact surface whose optics are `table` (`bsdf.Table.pack`).
 
     The contact surface is the mesh with id `contact`; LED number i is the shape with id `led_i`. Media are
     separated by single faces: guide to air (side walls), guide to glass, glass to air. The glass's rim is
     held in a black frame and nothing surrounds the sensor (a black housing). Side walls stay flat: their
     bulge under load, 0.1 mm, is left out.
     """
-    scene = describe(sensor, _contact_mesh(sensor, optics))
+    scene = describe(sensor, _contact_mesh(sensor, table))
     return mi.load_dict(scene, optimize=False)  # merging would lose the walls' names
 
 
@@ -110,14 +117,14 @@ def led_frame(led: Led, half_mm: float) -> tuple[np.ndarray, np.ndarray, np.ndar
     return centre, -outward, tangent
 
 
-def _contact_mesh(sensor: Sensor, optics: ContactOptics) -> mi.Mesh:
+def _contact_mesh(sensor: Sensor, table: mi.TensorXf) -> mi.Mesh:
     start = surface.flat(sensor.guide.width_mm, 0.0)
     shape = surface.triangulate(start)
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict(
         {
             "type": "frustrated_tir",
-            "table": bsdf.Table.pack(optics),
+            "table": table,
             "contact_fraction": {"type": "mesh_attribute", "name": "vertex_contact_fraction"},
         }
     )
@@ -132,10 +139,7 @@ def _contact_mesh(sensor: Sensor, optics: ContactOptics) -> mi.Mesh:
 
 
 def _fraction(sensor: Sensor, deformed: surface.OpticalSurface) -> np.ndarray:
-    skin = sensor.skin
-    fraction = contact_fraction(
-        deformed.pressure_kPa, sensor.effective_modulus_kPa, skin.rms_slope, skin.kappa
-    )
+    fraction = real_contact(deformed.pressure_kPa, sensor.skin, sensor.effective_modulus_kPa)
     return surface.with_skirt(fraction)
 
 

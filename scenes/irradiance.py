@@ -24,13 +24,14 @@ _RIM_CELLS = 2  # 0.5 mm
 
 @dataclass(frozen=True)
 class AngularBasis:
-    """Separable form of the contact's transmittance, T(A_r, cos) = sum_k rows[:, k](A_r) columns[k](cos).
+    """Separable form of what enters the tissue: phi_i(cos) T(A_r, cos) = sum_k rows[i, :, k] columns[k](cos).
 
-    Light arrives spread over angles, so T cannot be taken out of the integral over them; with this form the
-    integral is `count` irradiances, smooth over the surface, whatever the pressure does from pixel to pixel.
+    Light arrives spread over angles, so T and the tissue's lobes phi_i cannot be taken out of the integral
+    over them; with this form the integral is `count` irradiances, smooth over the surface, whatever the
+    pressure does.
     """
 
-    rows: Array  # (n_fraction, count)
+    rows: Array  # (modes, n_fraction, count)
     columns: Array  # (count, n_cos)
 
     @property
@@ -38,14 +39,16 @@ class AngularBasis:
         return self.columns.shape[0]
 
 
-def angular_basis(optics: ContactOptics, tolerance: float = 5e-5) -> AngularBasis:
-    """Truncated singular value decomposition of the table, largest error at most `tolerance`."""
-    u, s, v = np.linalg.svd(optics.transmittance, full_matrices=False)
+def angular_basis(optics: ContactOptics, lobes: Array, tolerance: float = 5e-5) -> AngularBasis:
+    """Truncated singular value decomposition, largest error at most `tolerance`; lobes (modes, n_cos) on the
+    table's cosines."""
+    products = (lobes[:, None] * optics.transmittance).reshape(-1, lobes.shape[1])
+    u, s, v = np.linalg.svd(products, full_matrices=False)
     for count in range(1, s.size + 1):
         rows, columns = u[:, :count] * s[:count], v[:count]
-        if np.abs(rows @ columns - optics.transmittance).max() <= tolerance:
+        if np.abs(rows @ columns - products).max() <= tolerance:
             break
-    return AngularBasis(rows, columns)
+    return AngularBasis(rows.reshape(len(lobes), -1, count), columns)
 
 
 def weigh(weights: mi.Float, count: int, n_cos: int, cosine: mi.Float, active: mi.Bool) -> list[mi.Float]:
@@ -65,9 +68,10 @@ def look_up(maps: Array, x: mi.Float, y: mi.Float) -> list[mi.Float]:
 
 
 def transmitted(basis: AngularBasis, irradiance: Array, fraction: Array) -> Array:
-    """Irradiance that enters the tissue, (n, m, m) W/mm², of (n, count, m, m) where the real contact fraction
-    is (m, m)."""
-    return np.einsum("yxk,nkyx->nyx", by_fraction(basis.rows, fraction), irradiance)
+    """Irradiance that enters the tissue in each mode, (n, modes, m, m) W/mm², of (n, count, m, m), where the
+    real contact fraction is (m, m)."""
+    rows = np.moveaxis(basis.rows, 0, 1)
+    return np.einsum("yxik,nkyx->niyx", by_fraction(rows, fraction), irradiance, optimize=True)
 
 
 def by_fraction(rows: Array, fraction: Array) -> Array:

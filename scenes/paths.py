@@ -170,11 +170,10 @@ def _step(  # type: ignore[no-untyped-def]
     corner = dr.select(gone, ray.o + _AWAY_MM * ray.d, si.p)
 
     # absorbed on the way, in proportion to what `trace` takes there
-    lost = {"guide": mi.Float(0.0), "glass": mi.Float(0.0)}
-    left = trace._absorb(sensor, lost, ray, si, mi.Float(1.0), met)
+    lost = trace.absorb(sensor, ray, si, mi.Float(1.0), met)
+    left = 1.0 - sum(lost.values(), mi.Float(0.0))
     absorbed = met & (u[0] >= left)
-    run = si.t * dr.log(dr.maximum(1.0 - dr.minimum(1.0 - u[0], 1.0 - left), 1e-30))
-    run /= dr.minimum(dr.log(dr.maximum(left, 1e-30)), -1e-12)
+    run = si.t * dr.log(dr.maximum(u[0], 1e-30)) / dr.minimum(dr.log(dr.maximum(left, 1e-30)), -1e-12)
     corner = dr.select(absorbed, ray.o + run * ray.d, corner)
     for name, part in lost.items():
         end(absorbed & (part > 0.0), name)
@@ -191,17 +190,9 @@ def _step(  # type: ignore[no-untyped-def]
     end(on_contact & (u[1] < table.transmittance(fraction, cosine, on_contact)), "tissue")
 
     elsewhere = met & ~on_contact
-    on_wall = elsewhere & trace._one_of(si.shape, shapes, "wall_")
-    painted = trace._painted(sensor, si, on_wall)
-    context = mi.BSDFContext(mi.TransportMode.Importance)
-    sample2 = mi.Point2f(u[3], u[4])
-    scattered, weight = si.bsdf(ray).sample(context, si, u[2], sample2, elsewhere & ~painted)
-    kept, direction = dr.select(elsewhere, weight[0], 1.0), scattered.wo
-    if sensor.guide.walls != "polished":
-        albedo = sensor.guide.wall_albedo if sensor.guide.walls == "diffuse" else 0.0
-        back = mi.warp.square_to_cosine_hemisphere(sample2)
-        kept = dr.select(painted, dr.select(cosine < 0.0, albedo, 0.0), kept)
-        direction = dr.select(painted, mi.Vector3f(back.x, back.y, -back.z), direction)
+    direction, kept, on_wall = trace.bounce_off(
+        sensor, shapes, ray, si, elsewhere, u[2], mi.Point2f(u[3], u[4])
+    )
     direction = dr.select(on_contact, mi.reflect(si.wi), direction)
     stops = elsewhere & (random.next_float32() >= kept)
     end(stops & trace._one_of(si.shape, shapes, "led_"), "leds")

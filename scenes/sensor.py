@@ -1,4 +1,4 @@
-"""The sensor as light sees it: guide, glass, LEDs, camera, skin and tissue (no Mitsuba here).
+"""The sensor as light sees it: guide, glass, LEDs, camera, skin, sheet and tissue (no Mitsuba here).
 
 Frame: the origin is the centre of the undeformed contact surface and +z points into the specimen, so the
 guide fills ``-thickness_mm <= z <= 0``, the glass lies below it and the camera's pinhole below the glass.
@@ -12,15 +12,13 @@ import math
 from collections.abc import Iterator
 from typing import Annotated, Literal, NamedTuple
 
-from pydantic import ConfigDict, Field
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False)
+from .skin import CONFIG, MIN_EXTINCTION, Absorption, RefractiveIndex, Skin, Tissue
 
-RefractiveIndex = Annotated[float, Field(ge=1.0, le=4.0)]
 # Bounds far outside of what such a sensor has, so that only slips (a unit, a power of ten) are refused.
 Length = Annotated[float, Field(ge=0.05, le=500.0)]
-Absorption = Annotated[float, Field(ge=0.0, le=10.0)]
 PixelSize = Annotated[float, Field(ge=0.1, le=1000.0)]
 Side = Literal["+x", "-x", "+y", "-y"]
 Coupling = Literal["air", "embedded"]
@@ -213,59 +211,6 @@ class Camera:
 
 
 @dataclass(frozen=True, config=CONFIG)
-class Skin:
-    """Rough contact between guide and tissue: how pressure turns into real contact and air gaps."""
-
-    rms_slope: Annotated[
-        float,
-        Field(
-            ge=0.01,
-            le=20.0,
-            description="Root-mean-square slope h' of the tissue's surface, without unit.",
-        ),
-    ] = 2.0
-    rms_height_um: Annotated[
-        float,
-        Field(
-            ge=0.1,
-            le=1000.0,
-            description="Root-mean-square height of the tissue's surface, µm; sets the gaps outside contact.",
-        ),
-    ] = 10.0
-    kappa: Annotated[
-        float,
-        Field(
-            ge=1.0,
-            le=4.0,
-            description="Factor of the contact law: 1.6 (Persson) to 2.5 (Bush, Gibson and Thomas).",
-        ),
-    ] = 1.6
-    gap_index: Annotated[
-        float,
-        Field(
-            ge=1.0, le=4.0, description="Refractive index of what fills the gaps: 1 for air, 1.33 for water."
-        ),
-    ] = 1.0
-
-
-@dataclass(frozen=True, config=CONFIG)
-class Tissue:
-    """The specimen's surface, as light sees it."""
-
-    refractive_index: Annotated[RefractiveIndex, Field(description="Refractive index of the specimen.")] = (
-        1.40
-    )
-    albedo: Annotated[
-        float,
-        Field(
-            ge=0.0,
-            lt=1.0,
-            description="Share of the light that enters the specimen and comes back out, 0 to 1.",
-        ),
-    ] = 0.68
-
-
-@dataclass(frozen=True, config=CONFIG)
 class Sensor:
     """All that the optics need to know, checked as a whole."""
 
@@ -321,6 +266,12 @@ def conflicts(guide: Guide, leds: tuple[Led, ...], camera: Camera, skin: Skin) -
             "skin.gap_index",
             skin.gap_index,
             f"a number below the guide's index {guide.refractive_index:g} (else no light is trapped)",
+        )
+    if skin.sheet and skin.sheet.scattering_per_mm + skin.sheet.absorption_per_mm < MIN_EXTINCTION:
+        yield Conflict(
+            "skin.sheet.scattering_per_mm",
+            skin.sheet.scattering_per_mm,
+            f"with the absorption at least {MIN_EXTINCTION:g} per mm (clear sheets are part of the guide)",
         )
 
 

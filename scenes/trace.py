@@ -19,6 +19,7 @@ from .bsdf import Table
 from .build import led_frame
 from .irradiance import AngularBasis, look_up, weigh
 from .sensor import Sensor
+from .tissue import Coupling
 
 Array = NDArray[np.float64]
 
@@ -90,7 +91,6 @@ def walk(
     named = {shape.id(): mi.ShapePtr(shape) for shape in scene.shapes()}
     contact = next(shape for shape in scene.shapes() if shape.id() == "contact")
     on = mi.ShapePtr(contact)
-    context = mi.BSDFContext(mi.TransportMode.Importance)
     lanes = dr.width(number)
     sequence = dr.arange(mi.UInt64, lanes) + 1
     random = mi.PCG32(size=lanes, initstate=dr.opaque(mi.UInt64, seed), initseq=sequence)
@@ -104,7 +104,9 @@ def walk(
     def step(ray, throughput, bounce, leg, alive, random, trapped, *ended):  # type: ignore[no-untyped-def]
         sink = dict(zip(SINKS, ended, strict=True))
         si = scene.ray_intersect(ray, alive)
-        throughput = _absorb(sensor, sink, ray, si, throughput, alive)
+        for medium, lost in absorb(sensor, ray, si, throughput, alive).items():
+            sink[medium] += lost
+            throughput = throughput - lost
         gone = alive & ~si.is_valid()
         down = ray.o.z < -sensor.guide.thickness_mm
         sink["below"] += dr.select(gone & down, throughput, 0.0)
@@ -132,16 +134,9 @@ def walk(
         sink["tissue"] += entering
         elsewhere = alive & ~on_contact
         sample1, sample2 = random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32())
-        on_wall = elsewhere & _one_of(si.shape, named, "wall_")
-        painted = _painted(sensor, si, on_wall)
-        scattered, weight = si.bsdf(ray).sample(context, si, sample1, sample2, elsewhere & ~painted)
-        kept = dr.select(on_contact, throughput - entering, dr.select(elsewhere, throughput * weight[0], 0.0))
-        direction = dr.select(on_contact, mi.reflect(si.wi), scattered.wo)
-        if sensor.guide.walls != "polished":
-            albedo = sensor.guide.wall_albedo if sensor.guide.walls == "diffuse" else 0.0
-            back = mi.warp.square_to_cosine_hemisphere(sample2)
-            kept = dr.select(painted, dr.select(cosine < 0.0, throughput * albedo, 0.0), kept)
-            direction = dr.select(painted, mi.Vector3f(back.x, back.y, -back.z), direction)
+        direction, share, on_wall = bounce_off(sensor, named, ray, si, elsewhere, sample1, sample2)
+        direction = dr.select(on_contact, mi.reflect(si.wi), direction)
+        kept = dr.select(on_contact, throughput - entering, throughput * share)
         stopped = dr.select(elsewhere, throughput - kept, 0.0)
         on_led = _one_of(si.shape, named, "led_")
         sink["leds"] += dr.select(on_led, stopped, 0.0)
@@ -188,12 +183,18 @@ def emit(sensor: Sensor, number: mi.UInt32, u: list[mi.Float]) -> mi.Ray3f:
 
 
 def re_emit(
-    scene: mi.Scene, sensor: Sensor, table: Table, upward: Array, number: mi.UInt32, u: list[mi.Float]
+    scene: mi.Scene,
+    sensor: Sensor,
+    table: Table,
+    coupling: Coupling,
+    upward: Array,
+    number: mi.UInt32,
+    u: list[mi.Float],
 ) -> tuple[mi.Ray3f, mi.Float]:
     """Rays from the contact surface as the tissue re-emits light, and what each carries, times their number.
 
-    Even over the guide's face, directions as in the lobe L = (n1/n3)² T(cos) U / pi; `upward` is U
-    (n_led, m, m), W/mm², on cells [iy, ix] of the guide's face.
+    Even over the guide's face, directions as T(cos) cos, weight as L = (n1/n3)² T sum phi_i(cos) V_i / pi;
+    `upward` is V (n_led, modes, m, m), W/mm², on cells [iy, ix] of the guide's face.
     """
     width = sensor.guide.width_mm
     x, y = (u[0] - 0.5) * width, (u[1] - 0.5) * width
@@ -202,16 +203,19 @@ def re_emit(
     contact = next(shape for shape in scene.shapes() if shape.id() == "contact")
     meets = si.is_valid() & (si.shape == mi.ShapePtr(contact))
     fraction = dr.select(meets, contact.eval_attribute_1("vertex_contact_fraction", si, meets), 0.0)
-    brightness = mi.Float(0.0)
-    for led, amount in enumerate(look_up(upward, u[0], u[1])):
-        brightness = dr.select(number == led, amount, brightness)
+    n_led, modes = upward.shape[:2]
+    layers = look_up(upward.reshape(n_led * modes, *upward.shape[2:]), u[0], u[1])
 
     # which of the table's two rows to draw from needs no even spread: any digits of the place will do
     digits = u[0] * 4096.0
     direction = table.draw(fraction, digits - dr.floor(digits), mi.Point2f(u[2], u[3]), meets)
     cosine = mi.Frame3f.cos_theta(direction)
-    squeezed = (sensor.guide.refractive_index / sensor.tissue.refractive_index) ** 2 * width**2
-    lobe = squeezed * table.transmittance(fraction, cosine, meets) * cosine * dr.inv_pi
+    lobes = table.lobes(cosine, meets)
+    brightness = mi.Float(0.0)
+    for led in range(n_led):
+        here = sum(lobe * layers[led * modes + i] for i, lobe in enumerate(lobes))
+        brightness = dr.select(number == led, here, brightness)
+    lobe = coupling.scale * width**2 * table.transmittance(fraction, cosine, meets) * cosine * dr.inv_pi
     brightness *= lobe / table.density(fraction, cosine, meets)
     return si.spawn_ray(si.to_world(direction)), dr.select(meets, dr.maximum(brightness, 0.0), 0.0)
 
@@ -224,30 +228,49 @@ def evenly(index: mi.UInt32, starts: np.ndarray) -> list[mi.Float]:
     ]
 
 
-def _absorb(
-    sensor: Sensor,
-    sink: dict[str, mi.Float],
-    ray: mi.Ray3f,
-    si: mi.SurfaceInteraction3f,
-    throughput: mi.Float,
-    alive: mi.Bool,
-) -> mi.Float:
-    """What is left after the way to the next face; its middle tells which medium that leads through."""
+def absorb(
+    sensor: Sensor, ray: mi.Ray3f, si: mi.SurfaceInteraction3f, throughput: mi.Float, alive: mi.Bool
+) -> dict[str, mi.Float]:
+    """What guide and glass take on the way to the next face; its middle tells through which it leads."""
     guide, glass = sensor.guide, sensor.glass
     if guide.absorption_per_mm == 0.0 and glass.absorption_per_mm == 0.0:
-        return throughput
+        return {}
     middle = ray.o + 0.5 * si.t * ray.d
     within = alive & si.is_valid() & (dr.maximum(dr.abs(middle.x), dr.abs(middle.y)) < guide.width_mm / 2)
     bottom = -guide.thickness_mm
-    for name, medium, here in (
-        ("guide", guide, middle.z > bottom),
-        ("glass", glass, (middle.z < bottom) & (middle.z > bottom - glass.thickness_mm)),
-    ):
-        lost = throughput * (1.0 - dr.exp(-medium.absorption_per_mm * si.t))
-        lost = dr.select(within & here, lost, 0.0)
-        sink[name] += lost
-        throughput = throughput - lost
-    return throughput
+    media = (
+        ("guide", guide.absorption_per_mm, middle.z > bottom),
+        ("glass", glass.absorption_per_mm, (middle.z < bottom) & (middle.z > bottom - glass.thickness_mm)),
+    )
+    return {
+        name: dr.select(within & here, throughput * (1.0 - dr.exp(-absorption * si.t)), 0.0)
+        for name, absorption, here in media
+    }
+
+
+def bounce_off(
+    sensor: Sensor,
+    named: dict[str, mi.ShapePtr],
+    ray: mi.Ray3f,
+    si: mi.SurfaceInteraction3f,
+    active: mi.Bool,
+    sample1: mi.Float,
+    sample2: mi.Point2f,
+) -> tuple[mi.Vector3f, mi.Float, mi.Bool]:
+    """Direction (local) and share of the light after a face that is not the contact, and whether it is a side
+    wall."""
+    on_wall = active & _one_of(si.shape, named, "wall_")
+    painted = _painted(sensor, si, on_wall)
+    context = mi.BSDFContext(mi.TransportMode.Importance)
+    scattered, weight = si.bsdf(ray).sample(context, si, sample1, sample2, active & ~painted)
+    direction, kept = scattered.wo, dr.select(active, weight[0], 0.0)
+    if sensor.guide.walls != "polished":
+        albedo = sensor.guide.wall_albedo if sensor.guide.walls == "diffuse" else 0.0
+        back = mi.warp.square_to_cosine_hemisphere(sample2)
+        from_inside = mi.Frame3f.cos_theta(si.wi) < 0.0
+        kept = dr.select(painted, dr.select(from_inside, albedo, 0.0), kept)
+        direction = dr.select(painted, mi.Vector3f(back.x, back.y, -back.z), direction)
+    return direction, kept, on_wall
 
 
 def _painted(sensor: Sensor, si: mi.SurfaceInteraction3f, on_wall: mi.Bool) -> mi.Bool:

@@ -16,12 +16,22 @@ from . import trace
 from .bsdf import Table
 from .irradiance import AngularBasis, smooth, transmitted
 from .sensor import Sensor
+from .spread import Spread
+from .tissue import Coupling
 
 Array = NDArray[np.float64]
 
 GRID = 200  # cells of the maps per side
 _ORDERS = 12  # of re-emission at most
 _ENOUGH = 1e-4  # share of the light below which the next order is left out
+
+
+@dataclass(frozen=True)
+class Behind:
+    """What lies behind the contact, and how light spreads in it."""
+
+    coupling: Coupling
+    spread: Spread
 
 
 @dataclass(frozen=True)
@@ -34,14 +44,10 @@ class Ground:
         Real contact fraction of the deformed surface there; 0 beside the surface.
     meets : (GRID, GRID)
         Whether the surface lies there.
-    escape : (GRID, GRID)
-        Share of the light from inside the tissue that passes, (n1/n3)² times the guide side's hemispherical
-        transmittance.
     """
 
     fraction: Array
     meets: NDArray[np.bool_]
-    escape: Array
 
 
 @dataclass(frozen=True)
@@ -50,8 +56,8 @@ class Light:
 
     Attributes
     ----------
-    upward : (n_led, GRID, GRID)
-        Flux that goes up inside the tissue towards the contact surface, U, W/mm².
+    upward : (n_led, modes, GRID, GRID)
+        Light that goes up inside the tissue towards the contact surface, V_i of `tissue`, W/mm².
     sinks : (n_led, len(trace.SINKS))
         W that end there; "tissue" is what the tissue keeps.
     trapped : (n_led,)
@@ -63,7 +69,7 @@ class Light:
     trapped: Array
 
 
-def survey(scene: mi.Scene, sensor: Sensor, table: Table) -> Ground:
+def survey(scene: mi.Scene, sensor: Sensor) -> Ground:
     """Look at the deformed surface from below, cell by cell."""
     width = sensor.guide.width_mm
     middles = (np.arange(GRID) + 0.5) / GRID * width - width / 2
@@ -73,10 +79,8 @@ def survey(scene: mi.Scene, sensor: Sensor, table: Table) -> Ground:
     si = scene.ray_intersect(mi.Ray3f(mi.Point3f(x, y, height), mi.Vector3f(0.0, 0.0, 1.0)))
     meets = si.is_valid() & (si.shape == mi.ShapePtr(contact))
     fraction = dr.select(meets, contact.eval_attribute_1("vertex_contact_fraction", si, meets), 0.0)
-    inward = (sensor.guide.refractive_index / sensor.tissue.refractive_index) ** 2
-    escape = dr.select(meets, inward * table.hemispherical(fraction, meets), 0.0)
-    found = [np.asarray(values).reshape(GRID, GRID) for values in (fraction, meets, escape)]
-    return Ground(found[0].astype(np.float64), found[1].astype(bool), found[2].astype(np.float64))
+    found = [np.asarray(values).reshape(GRID, GRID) for values in (fraction, meets)]
+    return Ground(found[0].astype(np.float64), found[1].astype(bool))
 
 
 def transport(
@@ -84,6 +88,7 @@ def transport(
     sensor: Sensor,
     table: Table,
     basis: AngularBasis,
+    behind: Behind,
     ground: Ground,
     straight: Array,
     samples: int,
@@ -117,8 +122,8 @@ def transport(
             leg = dr.gather(mi.UInt32, mi.UInt32(np.array(legs, dtype=np.uint32)), number)
             ray, amount, scale = trace.emit(sensor, number, u), dr.full(mi.Float, 1.0, n_led * each), flux
         else:
-            ray, amount = trace.re_emit(scene, sensor, table, upward, number, u)
-            scale = upward.mean(axis=(1, 2)) * sensor.guide.width_mm**2
+            ray, amount = trace.re_emit(scene, sensor, table, behind.coupling, upward, number, u)
+            scale = upward[:, 0].mean(axis=(1, 2)) * sensor.guide.width_mm**2
             amount /= dr.gather(mi.Float, mi.Float(np.maximum(scale, 1e-30)), number)
             leg = mi.UInt32(trace.OTHER)
         begun = np.asarray(amount, dtype=np.float64).reshape(n_led, each).mean(axis=1)
@@ -131,20 +136,19 @@ def transport(
     each = max(samples // 2, 1)
     maps, sinks, trapped, _ = walk(0, each, None)
     landed = straight + smooth(maps, GRID // trace.CELLS)
-    total = newest = _spread(sensor, basis, ground, landed)
+    total = newest = _spread(basis, behind, ground, landed)
     for order in range(1, _ORDERS + 1):
-        if newest.sum() <= _ENOUGH * total.sum():
+        if newest[:, 0].sum() <= _ENOUGH * total[:, 0].sum():
             break
         maps, more, _, begun = walk(order, max(each >> min(order - 1, 4), 1), newest)
         sinks = sinks + more
         sinks[:, 0] -= begun
-        newest = _spread(sensor, basis, ground, smooth(maps, GRID // trace.CELLS))
+        newest = _spread(basis, behind, ground, smooth(maps, GRID // trace.CELLS))
         total = total + newest
     return Light(total, sinks, trapped)
 
 
-def _spread(sensor: Sensor, basis: AngularBasis, ground: Ground, landed: Array) -> Array:
-    """Flux that goes up in the tissue, (n_led, GRID, GRID), from weighted irradiance."""
+def _spread(basis: AngularBasis, behind: Behind, ground: Ground, landed: Array) -> Array:
+    """Light that goes up in the tissue, (n_led, modes, GRID, GRID), from weighted irradiance."""
     entering = transmitted(basis, landed, ground.fraction) * ground.meets
-    albedo = sensor.tissue.albedo
-    return np.asarray(albedo * entering / (1.0 - albedo * (1.0 - ground.escape)))
+    return behind.spread.solve(entering, ground.fraction)

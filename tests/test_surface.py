@@ -201,9 +201,10 @@ def mi(variant: str) -> ModuleType:
 @pytest.fixture(scope="module")
 def scene(mi: ModuleType) -> Any:
     from scenes import build
+    from scenes.bsdf import Table
 
     sensor = paper_sensor()
-    return build.load_scene(sensor, build.optics_of(sensor))
+    return build.load_scene(sensor, Table.pack(build.optics_of(sensor)))
 
 
 def shoot(mi: ModuleType, scene: Any, count: int = 2000) -> tuple[np.ndarray, np.ndarray, Any]:

@@ -144,8 +144,11 @@ def _node(schema: Mapping[str, Any], location: Location) -> Mapping[str, Any]:
 
 
 def _resolved(schema: Mapping[str, Any], node: Mapping[str, Any] | None) -> Mapping[str, Any]:
-    while node is not None and "$ref" in node:
-        node = schema["$defs"][node["$ref"].rsplit("/", 1)[-1]]
+    while node is not None and ("$ref" in node or "anyOf" in node):
+        if "$ref" in node:
+            node = schema["$defs"][node["$ref"].rsplit("/", 1)[-1]]
+        else:  # a value that may be left out
+            node = next((kind for kind in node["anyOf"] if kind.get("type") != "null"), None)
     return node or {}
 
 
@@ -164,8 +167,6 @@ _BOUNDS = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "m
 
 def _in_words(schema: Mapping[str, Any], node: Mapping[str, Any] | None) -> str:
     node = _resolved(schema, node)
-    if "anyOf" in node:  # a value that may be left out
-        node = next((kind for kind in node["anyOf"] if kind.get("type") != "null"), node)
     if "enum" in node:
         return "one of " + ", ".join(repr(choice) for choice in node["enum"])
     match node.get("type"):

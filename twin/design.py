@@ -22,18 +22,8 @@ from pydantic.json_schema import GenerateJsonSchema
 
 import fem
 from fem.model import DomeRadius, Length, Modulus, Offset, Poisson, Sides, Tilt
-from scenes.sensor import (
-    Absorption,
-    Camera,
-    Glass,
-    Guide,
-    Led,
-    RefractiveIndex,
-    Sensor,
-    Skin,
-    Tissue,
-    Walls,
-)
+from scenes.sensor import Camera, Glass, Guide, Led, Sensor, Walls
+from scenes.skin import Absorption, Anisotropy, RefractiveIndex, Scattering, Skin, Tissue
 from twin.complaint import DesignError, from_validation, not_finite, shown
 from twin.conflicts import design_conflicts, inclusion_conflicts
 
@@ -110,14 +100,16 @@ class Specimen:
         Field(description="Sides of the slab: free, or symmetric, as if the tissue went on mirrored there."),
     ] = "free"
     refractive_index: Annotated[RefractiveIndex, Field(description="Refractive index of the tissue.")] = 1.40
-    albedo: Annotated[
-        float,
-        Field(
-            ge=0.0,
-            lt=1.0,
-            description="Share of the light that enters the tissue and comes back out, 0 to 1.",
-        ),
-    ] = 0.68
+    scattering_per_mm: Annotated[
+        Scattering, Field(description="Reduced scattering coefficient µs' = (1 - g) µs of the tissue, 1/mm.")
+    ] = 1.0
+    absorption_per_mm: Annotated[
+        Absorption, Field(description="Absorption coefficient µa of the tissue, 1/mm.")
+    ] = 0.02
+    anisotropy: Annotated[
+        Anisotropy,
+        Field(description="Mean cosine g of one scattering; only the volumetric reference uses it."),
+    ] = 0.0
 
 
 @dataclass(frozen=True, config=CONFIG)
@@ -182,7 +174,9 @@ class Design:
     ] = "finite"
     light: Annotated[Light, Field(description="What light the LEDs give.")] = Light()
     glass: Annotated[Glass, Field(description="The rigid plate between waveguide and camera.")] = Glass()
-    surface: Annotated[Skin, Field(description="The rough contact between waveguide and tissue.")] = Skin()
+    surface: Annotated[
+        Skin, Field(description="The contact between waveguide and tissue: roughness, film, dust, sheet.")
+    ] = Skin()
     press: Annotated[PressDepths, Field(description="The press, where nothing else is said.")] = PressDepths()
     signal: Annotated[Signal, Field(description="The thresholds k of the scalars.")] = Signal()
 
@@ -247,6 +241,11 @@ class Design:
             wall_albedo=waveguide.wall_albedo,
         )
 
+    def tissue(self) -> Tissue:
+        """Return the specimen as light sees it."""
+        slab = self.specimen
+        return Tissue(slab.refractive_index, slab.scattering_per_mm, slab.absorption_per_mm, slab.anisotropy)
+
     def sensor(self) -> Sensor:
         """Return the whole sensor as light sees it."""
         return Sensor(
@@ -255,15 +254,18 @@ class Design:
             leds=self.leds,
             camera=self.camera,
             skin=self.surface,
-            tissue=Tissue(refractive_index=self.specimen.refractive_index, albedo=self.specimen.albedo),
+            tissue=self.tissue(),
             effective_modulus_kPa=self.effective_modulus_kPa,
             wavelength_nm=self.light.wavelength_nm,
         )
 
     @property
     def effective_modulus_kPa(self) -> float:
-        """Contact modulus E*, kPa: 1/E* = sum of (1 - nu²)/E over both surfaces (Johnson 1985, eq. 4.24)."""
-        sides = (self.waveguide.layers[0], self.specimen)
+        """Contact modulus E*, kPa: 1/E* = sum of (1 - nu²)/E over both surfaces (Johnson 1985, eq. 4.24).
+
+        A contact sheet is what touches, so that its modulus counts in the tissue's place.
+        """
+        sides = (self.waveguide.layers[0], self.surface.sheet or self.specimen)
         return 1.0 / sum((1.0 - side.poisson**2) / side.modulus_kPa for side in sides)
 
     @property
