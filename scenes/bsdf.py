@@ -119,6 +119,28 @@ class Table:
         return dr.lerp(dr.gather(mi.Float, data, i, active), dr.gather(mi.Float, data, i + 1, active), u)
 
 
+def read_table(filename: str) -> mi.TensorXf:
+    """A packed table from an .npy file; relative names are looked for beside the scene file.
+
+    Raises ValueError, in one line, for a file that is no such table.
+    """
+    path = mi.file_resolver().resolve(filename)
+    try:
+        packed = np.load(str(path), allow_pickle=False)
+    except (OSError, ValueError) as error:
+        raise ValueError(
+            f"frustrated_tir: filename: received {filename!r} ({error}); allowed a table"
+        ) from None
+    if packed.ndim != 2 or min(packed.shape[0], packed.shape[1] - 2) < 2 or packed.dtype != np.float32:
+        received = f"{filename!r} with {packed.dtype} of shape {packed.shape}"
+        raise ValueError(f"frustrated_tir: filename: received {received}; allowed (2+, 4+) of float32")
+    if not (np.isfinite(packed).all() and packed.min() >= 0.0 and packed[:, :-1].max() <= 1.0 + 1e-5):
+        raise ValueError(
+            f"frustrated_tir: filename: received {filename!r} with numbers that are no shares of light"
+        )
+    return mi.TensorXf(packed)
+
+
 _BINS = 512  # of squared cosine, in which `Table.draw` takes T as constant
 _FLOOR = 1e-4  # of T there: no direction is left out
 
@@ -143,13 +165,14 @@ class FrustratedTIR(mi.BSDF):
 
     Reciprocal, and black from behind.
 
-    Properties: `table` (from `Table.pack`), `contact_fraction` (a texture, real contact fraction 0..1). The
-    side that the surface normal points to is the guide.
+    Properties: `table` (from `Table.pack`) or `filename` (of an .npy file that holds it), `contact_fraction`
+    (a texture, real contact fraction 0..1). The side that the surface normal points to is the guide.
     """
 
     def __init__(self, props: mi.Properties) -> None:
         mi.BSDF.__init__(self, props)
-        self.table = Table(mi.TensorXf(props["table"]))
+        packed = props["table"] if "table" in props else read_table(props["filename"])
+        self.table = Table(mi.TensorXf(packed))
         self.fraction = props["contact_fraction"]
         mirror = mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.FrontSide | mi.BSDFFlags.SpatiallyVarying
         diffuse = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide | mi.BSDFFlags.SpatiallyVarying

@@ -183,7 +183,8 @@ class Design:
     def __post_init__(self) -> None:
         found = list(design_conflicts(self))
         if found:
-            raise DesignError(found[0].field, found[0].received, found[0].allowed, more=len(found) - 1)
+            first, more = found[0], len(found) - 1
+            raise DesignError(first.field, first.received, first.allowed, more=more, conflicts=found)
 
     def probe(self) -> fem.Probe:
         """Return the waveguide as the mechanics see it."""

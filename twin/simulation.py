@@ -240,7 +240,7 @@ def _frame(
             "tared": scalars(image.astype(np.float64) - reference, k),
             "seconds": time.perf_counter() - start,
             "noise_percent": lit.noise_percent,
-            "saturated_percent": _saturated_percent(design, image, lit.radiance),
+            "saturated_percent": saturated_percent(design, image, lit.radiance),
         },
     )
 
@@ -255,7 +255,7 @@ def _how(design: Design, press: Press) -> dict[str, Any]:
     }
 
 
-def _saturated_percent(design: Design, image: np.ndarray, radiance: np.ndarray) -> float:
+def saturated_percent(design: Design, image: np.ndarray, radiance: np.ndarray) -> float:
     """Return the share of pixels at the converter's last count or at the full well, per cent.
 
     ``image`` is (rows, columns) counts, ``radiance`` (n_led, rows, columns) W m⁻² sr⁻¹.
