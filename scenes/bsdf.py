@@ -131,13 +131,14 @@ def read_table(filename: str) -> mi.TensorXf:
         raise ValueError(
             f"frustrated_tir: filename: received {filename!r} ({error}); allowed a table"
         ) from None
-    if packed.ndim != 2 or min(packed.shape[0], packed.shape[1] - 2) < 2 or packed.dtype != np.float32:
+    modes = packed[-1, -1] if packed.ndim == 2 and packed.size and packed.dtype == np.float32 else np.nan
+    if modes not in range(1, 9) or min(packed.shape[0] - modes, packed.shape[1] - 1 - modes**2) < 2:
         received = f"{filename!r} with {packed.dtype} of shape {packed.shape}"
-        raise ValueError(f"frustrated_tir: filename: received {received}; allowed (2+, 4+) of float32")
-    if not (np.isfinite(packed).all() and packed.min() >= 0.0 and packed[:, :-1].max() <= 1.0 + 1e-5):
-        raise ValueError(
-            f"frustrated_tir: filename: received {filename!r} with numbers that are no shares of light"
-        )
+        raise ValueError(f"frustrated_tir: filename: received {received}; allowed a table of `Table.pack`")
+    shares = packed[: -int(modes), : -int(modes**2)]
+    if not (np.isfinite(packed).all() and shares.min() >= 0.0 and shares.max() <= 1.0 + 1e-5):
+        received = f"{filename!r} with numbers that are no shares of light"
+        raise ValueError(f"frustrated_tir: filename: received {received}; allowed 0 to 1")
     return mi.TensorXf(packed)
 
 

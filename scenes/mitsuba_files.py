@@ -11,10 +11,8 @@ from xml.etree import ElementTree
 
 import mitsuba as mi
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from . import build, plugins, surface
-from .bsdf import Table
 from .reference import MAX_DEPTH, ROULETTE_DEPTH
 from .sensor import Sensor
 
@@ -23,16 +21,13 @@ FILES = (SCENE, CONTACT, TABLE)
 _SAMPLES = 64  # per pixel, where the user asks for no other number
 
 
-def write(sensor: Sensor, deformed: surface.OpticalSurface, folder: Path) -> None:
-    """Write the sensor with this contact surface into a folder.
+def write(sensor: Sensor, table: mi.TensorXf, deformed: surface.OpticalSurface, folder: Path) -> None:
+    """Write the sensor with this contact surface and its optics, `bsdf.Table.pack`, into a folder.
 
     `scene.xml` holds the same scene as `build.load_scene` (lengths in mm, radiance in W mm⁻² sr⁻¹) and stock
-    `path`; `contact.ply` the deformed surface with `vertex_contact_fraction`; `contact.npy` the packed table
-    of the contact's optics, float32, which `frustrated_tir` reads.
+    `path`; `contact.ply` the deformed surface with `vertex_contact_fraction`; `contact.npy` the packed
+    table as float32, which `frustrated_tir` reads.
     """
-    with threadpool_limits(1):  # as in `render.Renderer`: the same table to the last bit
-        optics = build.optics_of(sensor)
-        table = Table.pack(optics, build.coupling_of(sensor, optics))
     scene = build.load_scene(sensor, table)
     build.put_surface(scene, sensor, deformed)
     contact = next(shape for shape in scene.shapes() if shape.id() == "contact")

@@ -173,8 +173,7 @@ def _step(  # type: ignore[no-untyped-def]
     lost = trace.absorb(sensor, ray, si, mi.Float(1.0), met)
     left = 1.0 - sum(lost.values(), mi.Float(0.0))
     absorbed = met & (u[0] >= left)
-    run = si.t * dr.log(dr.maximum(1.0 - dr.minimum(1.0 - u[0], 1.0 - left), 1e-30))
-    run /= dr.minimum(dr.log(dr.maximum(left, 1e-30)), -1e-12)
+    run = si.t * dr.log(dr.maximum(u[0], 1e-30)) / dr.minimum(dr.log(dr.maximum(left, 1e-30)), -1e-12)
     corner = dr.select(absorbed, ray.o + run * ray.d, corner)
     for name, part in lost.items():
         end(absorbed & (part > 0.0), name)

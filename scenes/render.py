@@ -83,9 +83,9 @@ class Renderer:
             spreads = spread.spreader(body, coupling, sensor.guide.width_mm, transport.GRID)
             self.basis = angular_basis(optics, coupling.lobes)
         self.behind = transport.Behind(coupling, spreads)
-        packed = Table.pack(optics, coupling)
-        self.table = Table(packed)
-        self.scene = build.load_scene(sensor, packed)
+        self.packed = Table.pack(optics, coupling)
+        self.table = Table(self.packed)
+        self.scene = build.load_scene(sensor, self.packed)
 
     def render(
         self,
@@ -128,9 +128,6 @@ class Renderer:
         shape = surface.resample(pressed, self.sensor.guide.width_mm, suffix=field.removeprefix("pressure"))
         build.put_surface(self.scene, self.sensor, shape)
         sight = gather.look(self.scene, self.sensor, self.table, self.behind.coupling, self.rays)
-        samples = samples or PATHS_PER_LED[quality]
-        each = max(_PATHS_PER_PASS // len(self.sensor.leds), 1)
-        passes = max(_LEAST_PASSES, -(-samples // each))
         lights: list[Light] = []
         if quality == "reference":
             pictures = self._followed(sight, -(-samples // passes), seed)

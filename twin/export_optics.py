@@ -39,6 +39,8 @@ registers them, after a variant is set; they know llvm_ad_mono and cuda_ad_mono:
   scene = mi.load_file("scene.xml")
   picture = mi.render(scene, spp=64)        # slow: next-event estimation stops at the glass
 
+The tissue gives light back where it came in: `path` does not spread it sideways as the twin's pictures do.
+
 LLVM 15 and 16 abort the process: set DRJIT_LIBLLVM_PATH to a good one (19) first, or put
 `import scenes.backend; scenes.backend.use()` in place of the first two lines, which finds one.
 
@@ -117,12 +119,12 @@ def export(
 
 
 def _write_scene(design: Design, deformed: OpticalSurface, folder: Path) -> str:
-    from scenes import backend
+    from scenes import Renderer
 
-    backend.use("auto")
-    from scenes import mitsuba_files
+    renderer = Renderer(design.sensor())
+    from scenes import mitsuba_files  # only now that Mitsuba has its variant
 
-    mitsuba_files.write(design.sensor(), deformed, folder)
+    mitsuba_files.write(renderer.sensor, renderer.packed, deformed, folder)
     return _MITSUBA_README
 
 

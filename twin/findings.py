@@ -178,11 +178,10 @@ def _rim(checkup: Checkup) -> Iterator[Finding]:
 
 def _indices(checkup: Checkup) -> Iterator[Finding]:
     design = checkup.design
-    n, gap, tissue = (
-        design.waveguide.refractive_index,
-        design.surface.gap_index,
-        design.specimen.refractive_index,
-    )
+    n, gap = design.waveguide.refractive_index, design.surface.gap_index
+    sheet = design.surface.sheet
+    behind, field = (sheet, "surface.sheet") if sheet else (design.specimen, "specimen")
+    tissue = behind.refractive_index
     air = [str(k) for k, led in enumerate(design.leds) if led.coupling == "air"]
     if air and n**2 - 1.0 < gap**2:
         yield Finding(
@@ -197,9 +196,9 @@ def _indices(checkup: Checkup) -> Iterator[Finding]:
         angle = np.degrees(np.arcsin(tissue / n))
         yield Finding(
             "note",
-            "specimen.refractive_index",
+            f"{field}.refractive_index",
             f"light flatter than {90 - angle:.0f}° to the surface stays trapped even where contact is full",
-            f"The tissue's index ({tissue:g}) is below the guide's ({n:g})",
+            f"The {'sheet' if sheet else 'tissue'}'s index ({tissue:g}) is below the guide's ({n:g})",
             "A guide of lower index, or LEDs that shine more steeply, use more of the light",
         )
     if n - gap < 0.05:

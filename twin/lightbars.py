@@ -16,7 +16,7 @@ from twin.panels import INK
 
 # Fate of a path: colour, and words for the legend. What `scenes.paths` does not name yet is drawn black.
 FATES: dict[str, tuple[str, str]] = {
-    "tissue": ("#d7301f", "enters the tissue (bars: and stays there)"),
+    "tissue": ("#d7301f", "enters the tissue or sheet (bars: and stays there)"),
     "below": ("#08519c", "leaves below, a little of it into the camera"),
     "aside": ("#9e9e9e", "crosses the guide and leaves by a side face"),
     "missed": ("#d9d9d9", "goes by the guide, or is mirrored off its side"),
@@ -26,7 +26,6 @@ FATES: dict[str, tuple[str, str]] = {
     "guide": ("#41ab5d", "absorbed in the guide"),
     "glass": ("#006d2c", "absorbed in the glass"),
     "housing": ("#5d4037", "absorbed by the housing"),
-    "sheet": ("#c51b8a", "absorbed in the contact sheet"),
     "going": ("#f768a1", "not followed to its end"),
 }
 _FIRST = {

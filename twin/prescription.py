@@ -37,7 +37,6 @@ SINKS_IN_WORDS = {
     "frame": "glass's black frame",
     "leds": "LED bodies",
     "housing": "housing",
-    "sheet": "contact sheet",
     "below": "leaves below",
     "aside": "leaves aside, or never enters",
 }
@@ -173,7 +172,10 @@ def _balance(checkup: Checkup) -> Table:
     for key, part in checkup.sinks.items():
         if not part.any():
             continue
-        row(f"  {SINKS_IN_WORDS.get(key, key)}", part)
+        words = SINKS_IN_WORDS.get(key, key)
+        if key == "tissue" and design.surface.sheet is not None:
+            words = "contact sheet keeps"
+        row(f"  {words}", part)
         if key == "below":
             row("    of it into the camera", checkup.detected, "{:.2g}", style="dim")
     total = 100.0 * (checkup.emitted_W > 0) + checkup.closure_percent
