@@ -128,6 +128,9 @@ class Renderer:
         shape = surface.resample(pressed, self.sensor.guide.width_mm, suffix=field.removeprefix("pressure"))
         build.put_surface(self.scene, self.sensor, shape)
         sight = gather.look(self.scene, self.sensor, self.table, self.behind.coupling, self.rays)
+        samples = samples or PATHS_PER_LED[quality]
+        each = max(_PATHS_PER_PASS // len(self.sensor.leds), 1)
+        passes = max(_LEAST_PASSES, -(-samples // each))
         lights: list[Light] = []
         if quality == "reference":
             pictures = self._followed(sight, -(-samples // passes), seed)
