@@ -169,8 +169,8 @@ def test_spread_is_the_walk_under_a_face_that_changes_from_place_to_place(
 def test_trapped_light_comes_back_to_the_camera_as_the_walk_says(steps: ModuleType, fraction: float) -> None:
     """Trapped light (cosines 0.25 to 0.7 in the guide) enters a rough contact, evenly over the face.
 
-    What leaves within 20 degrees of the normal, where the camera is, agrees within 0.5 %, and all of it within
-    0.4 %. Lambertian tissue of the same total is 2 % (a quarter in contact) to 6 % (all) too bright there.
+    What leaves within 20 degrees of the normal, where the camera is, agrees within 0.5 %, and all of it
+    within 0.4 %. Lambertian tissue of the same total is 2 % (a quarter in contact) to 6 % (all) too bright.
     """
     import drjit as dr
     import mitsuba as mi
