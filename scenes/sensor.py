@@ -15,13 +15,14 @@ from typing import Annotated, Literal, NamedTuple
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from .skin import CONFIG, MIN_EXTINCTION, RefractiveIndex, Skin, Tissue
+from .skin import CONFIG, MIN_EXTINCTION, Absorption, RefractiveIndex, Skin, Tissue
 
 # Bounds far outside of what such a sensor has, so that only slips (a unit, a power of ten) are refused.
 Length = Annotated[float, Field(ge=0.05, le=500.0)]
 PixelSize = Annotated[float, Field(ge=0.1, le=1000.0)]
 Side = Literal["+x", "-x", "+y", "-y"]
 Coupling = Literal["air", "embedded"]
+Walls = Literal["polished", "absorbing", "diffuse"]
 
 
 class NotModelled(ValueError):
@@ -51,6 +52,19 @@ class Guide:
     refractive_index: Annotated[
         RefractiveIndex, Field(description="Refractive index of the guide at the light's wavelength.")
     ] = 1.4336
+    absorption_per_mm: Annotated[
+        Absorption, Field(description="Absorption coefficient of the guide, 1/mm (PDMS: about 0.001).")
+    ] = 0.0
+    walls: Annotated[
+        Walls,
+        Field(
+            description="Side faces: polished; or painted, but for windows before LEDs in air: absorbing, "
+            "or diffuse (white)."
+        ),
+    ] = "polished"
+    wall_albedo: Annotated[
+        float, Field(ge=0.0, le=1.0, description="Share of light that diffuse walls send back, 0 to 1.")
+    ] = 0.9
 
 
 @dataclass(frozen=True, config=CONFIG)
@@ -61,6 +75,9 @@ class Glass:
     refractive_index: Annotated[
         RefractiveIndex, Field(description="Refractive index of the plate at the light's wavelength.")
     ] = 1.515
+    absorption_per_mm: Annotated[
+        Absorption, Field(description="Absorption coefficient of the plate, 1/mm.")
+    ] = 0.0
 
 
 @dataclass(frozen=True, config=CONFIG)
@@ -105,6 +122,11 @@ class Led:
             description="Distance of the disc from the side face, mm: outside (air) or inside (embedded).",
         ),
     ] = 0.5
+
+    @property
+    def window_mm(self) -> float:
+        """Radius of the window before this LED in a painted wall: light from its rim gets in at 45°."""
+        return self.diameter_mm / 2 + self.gap_mm
 
 
 @dataclass(frozen=True, config=CONFIG)

@@ -19,6 +19,9 @@ from .ftir import gap_transmittance
 Array = NDArray[np.float64]
 Passing = Callable[[mi.Point3f, mi.Float], mi.Float]
 """Transmittance of the face at points (z = 0) for light from inside at a cosine, both on the device."""
+Witness = Callable[[mi.Point3f, mi.Vector3f, mi.Float, mi.Float, mi.Bool], None]
+"""Told of every collision: where, direction before it, share of the light after it, mean cosine g, and which
+lanes collide."""
 
 _FIXED_POINT = float(
     2**20
@@ -122,7 +125,7 @@ def walk(
             mi.Vector3f, photons
         )
     where = dr.zeros(mi.Point3f, photons)
-    where, direction, weight, through = roam(body, where, direction, random, fresnel(*indices))
+    where, direction, weight, through, _ = roam(body, where, direction, random, fresnel(*indices))
 
     lot = dr.arange(mi.UInt32, photons) % _LOTS
     rings = mi.Float(np.concatenate([[0.0], edges]).astype(np.float32))
@@ -148,8 +151,14 @@ def walk(
 
 
 def roam(
-    body: Body, where: mi.Point3f, direction: mi.Vector3f, random: mi.PCG32, passing: Passing
-) -> tuple[mi.Point3f, mi.Vector3f, mi.Float, mi.Float]:
+    body: Body,
+    where: mi.Point3f,
+    direction: mi.Vector3f,
+    random: mi.PCG32,
+    passing: Passing,
+    active: mi.Bool | bool = True,
+    witness: Witness | None = None,
+) -> tuple[mi.Point3f, mi.Vector3f, mi.Float, mi.Float, mi.PCG32]:
     """Follow light from points on or below the face until it leaves or is absorbed.
 
     Free paths are drawn for the densest medium; what collides elsewhere does so in proportion (delta
@@ -163,6 +172,8 @@ def roam(
         Share that leaves there, 0 where it was absorbed.
     through
         Share that was lost at the slab's other face.
+    random
+        Random numbers for what comes next.
     """
     lanes = dr.width(where)
     medium, ball = body.medium, body.ball
@@ -202,6 +213,8 @@ def roam(
             )
         collides = ~meets & (u3 < chance)
         weight = dr.select(collides, weight * share, weight)
+        if witness is not None:
+            witness(where, direction, weight, mean, alive & collides)
         turned = mi.Frame3f(direction).to_world(_scattered(mean, u1, u2, isotropic))
         thrown = mi.warp.square_to_cosine_hemisphere(mi.Point2f(u1, u2))
         lambert = mi.Vector3f(thrown.x, thrown.y, -dr.maximum(thrown.z, 1e-6))
@@ -222,12 +235,12 @@ def roam(
         mi.Vector3f(direction),
         dr.full(mi.Float, 1.0, lanes),
         dr.zeros(mi.Float, lanes),
-        dr.full(mi.Bool, True, lanes),
+        dr.full(mi.Bool, True, lanes) & active,
         dr.zeros(mi.UInt32, lanes),
         random,
     )
-    where, direction, weight, through, *_ = dr.while_loop(state, going, on, labels=_STATE)
-    return where, direction, weight, through
+    where, direction, weight, through, _, _, random = dr.while_loop(state, going, on, labels=_STATE)
+    return where, direction, weight, through, random
 
 
 def fresnel(n_body: float, n_before: float) -> Passing:

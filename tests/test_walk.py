@@ -139,7 +139,7 @@ def test_spread_is_the_walk_under_a_face_that_changes_from_place_to_place(
     u, s, t = (random.next_float32() for _ in range(3))
     start = mi.Point3f(4.0 * (u - 1.0), 0.0, 0.0)
     down = mi.warp.square_to_cosine_hemisphere(mi.Point2f(s, t))
-    place, _, weight, _ = steps.roam(
+    place, _, weight, _, _ = steps.roam(
         steps.Body(steps.Medium(1.0, 0.02)),
         start,
         down,

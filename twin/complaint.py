@@ -28,10 +28,21 @@ class DesignError(ValueError):
     """A value that cannot be: of a design, an inclusion or a press. Its text is one line.
 
     ``field`` is the dotted name, ``received`` the value as text, ``allowed`` what would do, ``source`` the
-    file (or "") and ``more`` how many other mistakes were found beside this one.
+    file (or "") and ``more`` how many other mistakes were found beside this one. ``conflicts`` holds them all
+    where every value alone can be read, but some do not fit the others.
     """
 
-    def __init__(self, field: str, received: str, allowed: str, *, source: str = "", more: int = 0) -> None:
+    def __init__(
+        self,
+        field: str,
+        received: str,
+        allowed: str,
+        *,
+        source: str = "",
+        more: int = 0,
+        conflicts: Sequence[DesignError] = (),
+    ) -> None:
+        self.conflicts = tuple(conflicts)
         self.field, self.received, self.allowed, self.source, self.more = (
             field,
             received,
@@ -51,6 +62,7 @@ class DesignError(ValueError):
             self.allowed,
             source=self.source if source is None else source,
             more=self.more,
+            conflicts=self.conflicts,
         )
 
 
@@ -68,7 +80,8 @@ def from_validation(error: ValidationError, data: object, schema: Mapping[str, A
     first, more = errors[0], len(errors) - 1
     cause = first.get("ctx", {}).get("error")
     if isinstance(cause, DesignError):
-        return DesignError(cause.field, cause.received, cause.allowed, more=cause.more + more)
+        more += cause.more
+        return DesignError(cause.field, cause.received, cause.allowed, more=more, conflicts=cause.conflicts)
     field, received, allowed = _words(first, data, schema)
     return DesignError(field, received, allowed, more=more)
 

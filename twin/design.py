@@ -22,7 +22,7 @@ from pydantic.json_schema import GenerateJsonSchema
 
 import fem
 from fem.model import DomeRadius, Length, Modulus, Offset, Poisson, Sides, Tilt
-from scenes.sensor import Camera, Glass, Guide, Led, Sensor
+from scenes.sensor import Camera, Glass, Guide, Led, Sensor, Walls
 from scenes.skin import Absorption, Anisotropy, RefractiveIndex, Scattering, Skin, Tissue
 from twin.complaint import DesignError, from_validation, not_finite, shown
 from twin.conflicts import design_conflicts, inclusion_conflicts
@@ -54,6 +54,19 @@ class Waveguide:
     refractive_index: Annotated[
         RefractiveIndex, Field(description="Refractive index of all layers at the light's wavelength.")
     ] = 1.4336
+    absorption_per_mm: Annotated[
+        Absorption, Field(description="Absorption coefficient of all layers, 1/mm (PDMS: about 0.001).")
+    ] = 0.0
+    walls: Annotated[
+        Walls,
+        Field(
+            description="Side faces: polished; or painted, but for windows before LEDs in air: absorbing, "
+            "or diffuse (white)."
+        ),
+    ] = "polished"
+    wall_albedo: Annotated[
+        float, Field(ge=0.0, le=1.0, description="Share of light that diffuse walls send back, 0 to 1.")
+    ] = 0.9
     dome_radius_mm: Annotated[
         DomeRadius,
         Field(description="Radius of a domed contact surface with its apex in the middle, mm; none if flat."),
@@ -170,7 +183,8 @@ class Design:
     def __post_init__(self) -> None:
         found = list(design_conflicts(self))
         if found:
-            raise DesignError(found[0].field, found[0].received, found[0].allowed, more=len(found) - 1)
+            first, more = found[0], len(found) - 1
+            raise DesignError(first.field, first.received, first.allowed, more=more, conflicts=found)
 
     def probe(self) -> fem.Probe:
         """Return the waveguide as the mechanics see it."""
@@ -218,7 +232,14 @@ class Design:
     def guide(self) -> Guide:
         """Return the waveguide as light sees it."""
         waveguide = self.waveguide
-        return Guide(waveguide.width_mm, waveguide.thickness_mm, waveguide.refractive_index)
+        return Guide(
+            width_mm=waveguide.width_mm,
+            thickness_mm=waveguide.thickness_mm,
+            refractive_index=waveguide.refractive_index,
+            absorption_per_mm=waveguide.absorption_per_mm,
+            walls=waveguide.walls,
+            wall_albedo=waveguide.wall_albedo,
+        )
 
     def tissue(self) -> Tissue:
         """Return the specimen as light sees it."""

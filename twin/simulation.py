@@ -163,13 +163,6 @@ def check(
     by_force: bool = False,
 ) -> None:
     """Raise, before any work is done, if the press cannot be simulated: levels are mm, or N ``by_force``."""
-    from scenes.sensor import NotModelled
-
-    if design.waveguide.dome_radius_mm is not None:
-        raise NotModelled(
-            f"waveguide.dome_radius_mm: received {design.waveguide.dome_radius_mm:g}; not modelled: light in "
-            "a domed guide; allowed is a flat one, without this key (twin export presses domed ones)"
-        )
     presses.check(design, inclusion, levels, by_force=by_force)
 
 
@@ -247,7 +240,7 @@ def _frame(
             "tared": scalars(image.astype(np.float64) - reference, k),
             "seconds": time.perf_counter() - start,
             "noise_percent": lit.noise_percent,
-            "saturated_percent": _saturated_percent(design, image, lit.radiance),
+            "saturated_percent": saturated_percent(design, image, lit.radiance),
         },
     )
 
@@ -262,7 +255,7 @@ def _how(design: Design, press: Press) -> dict[str, Any]:
     }
 
 
-def _saturated_percent(design: Design, image: np.ndarray, radiance: np.ndarray) -> float:
+def saturated_percent(design: Design, image: np.ndarray, radiance: np.ndarray) -> float:
     """Return the share of pixels at the converter's last count or at the full well, per cent.
 
     ``image`` is (rows, columns) counts, ``radiance`` (n_led, rows, columns) W m⁻² sr⁻¹.
