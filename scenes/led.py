@@ -1,0 +1,124 @@
+"""An LED: where it sits, how much it gives, and what of that cannot be."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Annotated, Literal
+
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from .quantity import CONFIG, Conflict
+
+Side = Literal["+x", "-x", "+y", "-y"]
+Coupling = Literal["air", "embedded"]
+
+
+@dataclass(frozen=True, config=CONFIG)
+class Led:
+    """One LED at a side face of the guide: a Lambertian disc that faces the guide's middle."""
+
+    side: Annotated[Side, Field(description="Side face of the guide that the LED sits at: +x, -x, +y or -y.")]
+    along_mm: Annotated[
+        float,
+        Field(
+            ge=-250.0,
+            le=250.0,
+            description="Place of the LED's centre along that side, from the middle of the side, mm.",
+        ),
+    ] = 0.0
+    z_mm: Annotated[
+        float,
+        Field(
+            ge=-500.0,
+            lt=0.0,
+            description="Height of the LED's centre, mm; 0 is the contact surface, negative is below it.",
+        ),
+    ] = -5.0
+    diameter_mm: Annotated[
+        float, Field(ge=0.01, le=500.0, description="Diameter of the emitting disc, mm.")
+    ] = 1.5
+    flux_W: Annotated[
+        float, Field(ge=0.0, le=1000.0, description="Radiant flux of the LED, W (0 is a failed LED).")
+    ] = 0.010
+    coupling: Annotated[
+        Coupling,
+        Field(
+            description="'air': outside, through the flat side face; 'embedded': inside the guide, "
+            "which leaks light through the contact surface and shows hot spots."
+        ),
+    ] = "air"
+    gap_mm: Annotated[
+        float,
+        Field(
+            ge=1e-3,
+            le=100.0,
+            description="Distance of the disc from the side face, mm: outside (air) or inside (embedded).",
+        ),
+    ] = 0.5
+
+
+def led_conflicts(leds: tuple[Led, ...], width: float, thickness: float) -> Iterator[Conflict]:
+    """Yield what keeps LEDs from standing at a guide of this width and thickness, mm."""
+    for number, led in enumerate(leds):
+        yield from _place_conflicts(f"leds.{number}", led, width, thickness)
+    yield from _overlapping_leds(leds, width)
+
+
+def _place_conflicts(path: str, led: Led, width: float, thickness: float) -> Iterator[Conflict]:
+    """The emitting disc must lie on its side face, and an embedded one in its own half of the guide."""
+    radius = led.diameter_mm / 2
+    if led.diameter_mm > min(width, thickness):
+        yield Conflict(
+            f"{path}.diameter_mm", led.diameter_mm, f"at most the side face of {width:g} x {thickness:g} mm"
+        )
+        return
+    reach = width / 2 - radius
+    if abs(led.along_mm) > reach:
+        yield Conflict(
+            f"{path}.along_mm",
+            led.along_mm,
+            f"-{reach:g} to {reach:g} mm (the disc stays on the guide's side)",
+        )
+    if not radius - thickness <= led.z_mm <= -radius:
+        yield Conflict(
+            f"{path}.z_mm",
+            led.z_mm,
+            f"{radius - thickness:g} to {-radius:g} mm (the disc stays on the guide's side)",
+        )
+    if led.coupling == "embedded" and led.gap_mm >= width / 2:
+        yield Conflict(
+            f"{path}.gap_mm", led.gap_mm, f"less than {width / 2:g} mm (half the guide) for an embedded LED"
+        )
+
+
+def _overlapping_leds(leds: tuple[Led, ...], width: float) -> Iterator[Conflict]:
+    """No two discs may overlap in one plane, nor embedded ones of neighbouring sides cut each other."""
+    for number, led in enumerate(leds):
+        for earlier in range(number):
+            if _touch(leds[earlier], led, width):
+                place = (led.side, led.along_mm, led.z_mm)
+                yield Conflict(f"leds.{number}", place, f"a place where it does not cut leds.{earlier}")
+
+
+def _touch(one: Led, other: Led, width: float) -> bool:
+    radii = one.diameter_mm / 2, other.diameter_mm / 2
+    if one.coupling != other.coupling:
+        return False  # the side face lies between them
+    if one.side == other.side:
+        apart = math.hypot(one.along_mm - other.along_mm, one.z_mm - other.z_mm)
+        return math.isclose(one.gap_mm, other.gap_mm, abs_tol=1e-9) and apart < sum(radii) * (1 - 1e-9)
+    if one.coupling == "air" or one.side[1] == other.side[1]:
+        return False  # outside different faces, or parallel planes in different halves of the guide
+    # Planes of neighbouring sides meet in an upright line; each disc covers a stretch of it, if any.
+    away = other.along_mm - _plane(one, width), one.along_mm - _plane(other, width)
+    squares = radii[1] ** 2 - away[0] ** 2, radii[0] ** 2 - away[1] ** 2
+    if min(squares) <= 0.0:
+        return False
+    return abs(one.z_mm - other.z_mm) < math.sqrt(squares[0]) + math.sqrt(squares[1])
+
+
+def _plane(led: Led, width: float) -> float:
+    """The x (or y) of an embedded LED's disc, mm."""
+    return float(f"{led.side[0]}1") * (width / 2 - led.gap_mm)
