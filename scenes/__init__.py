@@ -15,6 +15,7 @@ from .sensor import Camera, Glass, Guide, Led, Sensor, Skin, Tissue
 
 if TYPE_CHECKING:
     from .render import Renderer, Rendering
+    from .spectral import SpectralRenderer
 
 __all__ = [
     "Camera",
@@ -25,6 +26,7 @@ __all__ = [
     "Rendering",
     "Sensor",
     "Skin",
+    "SpectralRenderer",
     "Tissue",
     "expose",
     "gap_transmittance",
@@ -38,4 +40,8 @@ def __getattr__(name: str) -> Any:
         from . import render
 
         return getattr(render, name)
+    if name == "SpectralRenderer":
+        from .spectral import SpectralRenderer
+
+        return SpectralRenderer
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

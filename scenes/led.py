@@ -9,9 +9,13 @@ from typing import Annotated, Literal
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from .quantity import CONFIG, Conflict
+from .quantity import CONFIG, Conflict, Wavelength
+from .spectrum import ILLUMINANTS, SpectrumName, efficacy
 
-Side = Literal["+x", "-x", "+y", "-y"]
+FLUX_W = 0.010
+"""Flux of an LED of which nothing is said, W."""
+
+Side = Literal["+x", "-x", "+y", "-y", "below"]
 Coupling = Literal["air", "embedded"]
 
 
@@ -41,7 +45,26 @@ class Led:
     ] = 1.5
     flux_W: Annotated[
         float, Field(ge=0.0, le=1000.0, description="Radiant flux of the LED, W (0 is a failed LED).")
-    ] = 0.010
+    ] = FLUX_W
+    flux_lm: Annotated[
+        float | None,
+        Field(ge=0.0, le=1e6, description="Luminous flux of the LED, lm, in place of flux_W."),
+    ] = None
+    spectrum: Annotated[
+        SpectrumName,
+        Field(
+            description="line; gaussian (peak_nm, fwhm_nm); or a typical LED of the CIE: B1 to B5 white of "
+            "blue and phosphor, warm to cold, BH1 with red, RGB1 of three colours, V1 and V2 of violet."
+        ),
+    ] = "line"
+    peak_nm: Annotated[
+        Wavelength | None,
+        Field(description="Wavelength of the line (light.wavelength_nm if left out) or of the peak, nm."),
+    ] = None
+    fwhm_nm: Annotated[
+        float | None,
+        Field(ge=0.1, le=300.0, description="Full width at half maximum of a gaussian spectrum, nm."),
+    ] = None
     coupling: Annotated[
         Coupling,
         Field(
@@ -58,11 +81,24 @@ class Led:
         ),
     ] = 0.5
 
+    def __post_init__(self) -> None:
+        """Turn lumens into watts, where nothing was said of watts."""
+        per_watt = None if self.flux_lm is None else self.lumens_per_watt
+        if self.flux_lm is not None and per_watt and self.flux_W == FLUX_W:
+            object.__setattr__(self, "flux_W", self.flux_lm / per_watt)
+
+    @property
+    def lumens_per_watt(self) -> float | None:
+        """Lumens per watt of its spectrum; None where the spectrum lacks its numbers."""
+        needs = {"line": (self.peak_nm,), "gaussian": (self.peak_nm, self.fwhm_nm)}.get(self.spectrum, ())
+        return None if None in needs else efficacy(self.spectrum, self.peak_nm, self.fwhm_nm)
+
 
 def led_conflicts(leds: tuple[Led, ...], width: float, thickness: float) -> Iterator[Conflict]:
     """Yield what keeps LEDs from standing at a guide of this width and thickness, mm."""
     for number, led in enumerate(leds):
         yield from _place_conflicts(f"leds.{number}", led, width, thickness)
+        yield from _light_conflicts(f"leds.{number}", led)
     yield from _overlapping_leds(leds, width)
 
 
@@ -91,6 +127,28 @@ def _place_conflicts(path: str, led: Led, width: float, thickness: float) -> Ite
         yield Conflict(
             f"{path}.gap_mm", led.gap_mm, f"less than {width / 2:g} mm (half the guide) for an embedded LED"
         )
+
+
+def _light_conflicts(path: str, led: Led) -> Iterator[Conflict]:
+    """A spectrum has its own numbers and no others, and flux is given once."""
+    if led.spectrum == "gaussian" and led.peak_nm is None:
+        yield Conflict(f"{path}.peak_nm", led.peak_nm, "a wavelength, nm, for a gaussian spectrum")
+    if led.spectrum == "gaussian" and led.fwhm_nm is None:
+        yield Conflict(f"{path}.fwhm_nm", led.fwhm_nm, "a width, nm, for a gaussian spectrum")
+    if led.spectrum in ILLUMINANTS and led.peak_nm is not None:
+        yield Conflict(f"{path}.peak_nm", led.peak_nm, f"none with {led.spectrum}, which is a table")
+    if led.spectrum != "gaussian" and led.fwhm_nm is not None:
+        yield Conflict(f"{path}.fwhm_nm", led.fwhm_nm, "none but with a gaussian spectrum")
+    if led.flux_lm is None:
+        return
+    per_watt = led.lumens_per_watt
+    if per_watt is None:
+        allowed = "a flux_W, or this with the peak_nm (and fwhm_nm) that turns lumens into watts"
+        yield Conflict(f"{path}.flux_lm", led.flux_lm, allowed)
+    elif per_watt < 1e-3:
+        yield Conflict(f"{path}.flux_lm", led.flux_lm, "a flux_W, where light is invisible")
+    elif not math.isclose(led.flux_W * per_watt, led.flux_lm, rel_tol=1e-6, abs_tol=1e-12):
+        yield Conflict(f"{path}.flux_lm", led.flux_lm, f"none beside flux_W = {led.flux_W:g}: one of the two")
 
 
 def _overlapping_leds(leds: tuple[Led, ...], width: float) -> Iterator[Conflict]:

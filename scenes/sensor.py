@@ -9,11 +9,13 @@ against each other.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Annotated
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
+from .dispersion import GLASS, Glassware
 from .imager import Camera, camera_conflicts
 from .led import Led, Side, led_conflicts
 from .quantity import CONFIG, Conflict, Length, RefractiveIndex, Wavelength
@@ -55,8 +57,18 @@ class Glass:
 
     thickness_mm: Annotated[Length, Field(description="Thickness of the plate, mm.")] = 2.0
     refractive_index: Annotated[
-        RefractiveIndex, Field(description="Refractive index of the plate at the light's wavelength.")
+        RefractiveIndex, Field(description="Refractive index of the plate, the same for all light.")
     ] = 1.515
+    material: Annotated[
+        Glassware | None,
+        Field(description="Glass whose index over wavelength takes the place of refractive_index."),
+    ] = None
+
+    def at(self, wavelength_nm: float) -> Glass:
+        """Return the plate as light of this wavelength sees it."""
+        if self.material is None:
+            return self
+        return replace(self, refractive_index=GLASS[self.material](wavelength_nm), material=None)
 
 
 @dataclass(frozen=True, config=CONFIG)

@@ -22,6 +22,8 @@ from pydantic.json_schema import GenerateJsonSchema
 
 import fem
 from fem.model import DomeRadius, Length, Modulus, Offset, Poisson, Sides, Tilt
+from scenes import dispersion
+from scenes.quantity import Wavelength
 from scenes.sensor import Camera, Glass, Guide, Led, RefractiveIndex, Sensor, Skin, Tissue
 from twin.complaint import DesignError, from_validation, not_finite, shown
 from twin.conflicts import design_conflicts, inclusion_conflicts
@@ -51,8 +53,12 @@ class Waveguide:
         Field(min_length=1, max_length=16, description="Elastic layers, from the contact side."),
     ]
     refractive_index: Annotated[
-        RefractiveIndex, Field(description="Refractive index of all layers at the light's wavelength.")
-    ] = 1.4336
+        RefractiveIndex | None,
+        Field(
+            description="Refractive index of all layers, the same for all light; that of Sylgard 184, which "
+            "falls with the wavelength, if left out."
+        ),
+    ] = None
     dome_radius_mm: Annotated[
         DomeRadius,
         Field(description="Radius of a domed contact surface with its apex in the middle, mm; none if flat."),
@@ -69,8 +75,16 @@ class Light:
     """The light of the LEDs."""
 
     wavelength_nm: Annotated[
-        float, Field(ge=350.0, le=1100.0, description="Wavelength of the light, nm.")
+        Wavelength,
+        Field(
+            description="Wavelength of LEDs that are a line, nm. Light of other wavelengths is told as "
+            "radiance of this one that the camera would answer alike."
+        ),
     ] = 550.0
+    bands: Annotated[
+        int,
+        Field(ge=1, le=64, description="Wavelengths that a spectrum is rendered at; a line takes one."),
+    ] = 3
 
 
 @dataclass(frozen=True, config=CONFIG)
@@ -210,22 +224,24 @@ class Design:
         except ValidationError as error:
             raise from_validation(error, given, design_schema()) from None
 
-    def guide(self) -> Guide:
-        """Return the waveguide as light sees it."""
-        waveguide = self.waveguide
-        return Guide(waveguide.width_mm, waveguide.thickness_mm, waveguide.refractive_index)
+    def guide(self, wavelength_nm: float | None = None) -> Guide:
+        """Return the waveguide as light of a wavelength sees it, by default that of `light`."""
+        waveguide, index = self.waveguide, self.waveguide.refractive_index
+        index = index or dispersion.pdms(wavelength_nm or self.light.wavelength_nm)
+        return Guide(waveguide.width_mm, waveguide.thickness_mm, index)
 
-    def sensor(self) -> Sensor:
-        """Return the whole sensor as light sees it."""
+    def sensor(self, wavelength_nm: float | None = None) -> Sensor:
+        """Return the whole sensor as light of a wavelength sees it, by default that of `light`."""
+        wavelength = wavelength_nm or self.light.wavelength_nm
         return Sensor(
-            guide=self.guide(),
-            glass=self.glass,
+            guide=self.guide(wavelength),
+            glass=self.glass.at(wavelength),
             leds=self.leds,
             camera=self.camera,
             skin=self.surface,
             tissue=Tissue(refractive_index=self.specimen.refractive_index, albedo=self.specimen.albedo),
             effective_modulus_kPa=self.effective_modulus_kPa,
-            wavelength_nm=self.light.wavelength_nm,
+            wavelength_nm=wavelength,
         )
 
     @property

@@ -21,7 +21,7 @@ from twin.presses import Mechanics, Quality
 
 if TYPE_CHECKING:
     from fem import Press
-    from scenes import Renderer, Rendering
+    from scenes import Rendering, SpectralRenderer
 
 Device = Literal["auto", "cpu", "cuda"]
 Progress = Callable[[str, float], None]
@@ -126,9 +126,9 @@ def simulate(
     levels, by_force, several = presses.levels_of(design, indentation, force)
     check(design, inclusion, levels, by_force=by_force)
     seed = _seed(seed)
-    from scenes import Renderer
+    from scenes import SpectralRenderer
 
-    renderer = Renderer(design.sensor(), device=device)
+    renderer = SpectralRenderer(design.sensor(), count=design.light.bands, at=design.sensor, device=device)
     work = _Work(progress or (lambda stage, done: None), len(levels), _seconds(design, len(levels)))
     pressed = presses.solved(
         design,
@@ -187,7 +187,7 @@ def _frame(
     design: Design,
     inclusion: fem.Inclusion | None,
     press: Press,
-    renderer: Renderer,
+    renderer: SpectralRenderer,
     quality: Quality,
     seed: int,
     level: float,
