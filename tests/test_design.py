@@ -339,5 +339,7 @@ def test_a_path_is_read_and_a_missing_one_is_named(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text(TSIS.replace('name = "tsis"', 'name = "mine"'), encoding="utf-8")
     assert load_design(path).name == "mine"
-    with pytest.raises(DesignError, match=r"absent.toml'; allowed a shipped design \(tsis\) or a TOML file"):
+    with pytest.raises(
+        DesignError, match=r"absent.toml'; allowed a shipped design \(rgb, tsis, white\) or a TOML file"
+    ):
         load_design(tmp_path / "absent.toml")
