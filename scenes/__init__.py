@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from .camera import expose, mean_counts, tare
 from .ftir import gap_transmittance
-from .sensor import Camera, Glass, Guide, Led, Sensor, Skin, Tissue
+from .sensor import Camera, Glass, Guide, Led, Sensor, Sheet, Skin, Tissue
 
 if TYPE_CHECKING:
     from .render import Renderer, Rendering
@@ -25,6 +25,7 @@ __all__ = [
     "Renderer",
     "Rendering",
     "Sensor",
+    "Sheet",
     "Skin",
     "SpectralRenderer",
     "Tissue",

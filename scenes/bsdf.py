@@ -12,31 +12,44 @@ import mitsuba as mi
 import numpy as np
 
 from .contact import ContactOptics
+from .tissue import Coupling
 
 
 class Table:
-    """A `ContactOptics` on the device, looked up bilinearly.
+    """A `ContactOptics` and the tissue's lobes on the device, looked up (bi)linearly.
 
-    `transmittance(fraction, cosine)`, `hemispherical(fraction)` and `diffuse_gain(fraction)` take and
-    return `mi.Float`.
+    `transmittance(fraction, cosine)`, `hemispherical(fraction)`, `lobes(cosine)` and
+    `diffuse(fraction, cosine_in, cosine_out)` take and return `mi.Float`.
     """
 
     def __init__(self, packed: mi.TensorXf) -> None:
-        self.rows, self.columns = packed.shape[0], packed.shape[1] - 2
-        columns = packed.numpy()
-        self._t = mi.Float(columns[:, :-2].ravel())
-        self._mean = mi.Float(columns[:, -2].copy())
-        self._gain = mi.Float(columns[:, -1].copy())
-        binned, summed = _binned(columns[:, :-2].astype(np.float64))
+        values = packed.numpy()
+        self.modes = int(values[-1, -1])
+        self.rows, self.columns = values.shape[0] - self.modes, values.shape[1] - 1 - self.modes**2
+        top = values[: self.rows]
+        self._t = mi.Float(np.ascontiguousarray(top[:, : self.columns]).ravel())
+        self._mean = mi.Float(top[:, self.columns].copy())
+        self._gain = [mi.Float(column.copy()) for column in top[:, self.columns + 1 :].T]
+        self._lobes = [mi.Float(row[: self.columns].copy()) for row in values[self.rows :]]
+        binned, summed = _binned(top[:, : self.columns].astype(np.float64))
         self._binned = mi.Float(binned.astype(np.float32).ravel())
         self._summed = mi.Float(summed.astype(np.float32).ravel())
         self._all = mi.Float(summed[:, -1].astype(np.float32))
 
     @staticmethod
-    def pack(optics: ContactOptics) -> mi.TensorXf:
-        """One (n_fraction, n_cos + 2) tensor, the form in which a Mitsuba scene description can carry it."""
-        sides = (optics.transmittance, optics.hemispherical[:, None], optics.diffuse_gain[:, None])
-        return mi.TensorXf(np.hstack(sides).astype(np.float32))
+    def pack(optics: ContactOptics, coupling: Coupling | None = None) -> mi.TensorXf:
+        """One tensor, the form in which a Mitsuba scene description can carry it.
+
+        (n_fraction + modes, n_cos + 1 + modes²): T, its hemispherical mean and the gains K_ij, and below them
+        the lobes and, as last number, how many there are. Without `coupling`, one even lobe.
+        """
+        rows, columns = optics.transmittance.shape
+        lobes = np.ones((1, columns)) if coupling is None else coupling.lobes
+        gain = optics.diffuse_gain[:, None, None] if coupling is None else coupling.gain
+        top = np.hstack([optics.transmittance, optics.hemispherical[:, None], gain.reshape(rows, -1)])
+        packed = np.zeros((rows + len(lobes), top.shape[1]), dtype=np.float32)
+        packed[:rows], packed[rows:, :columns], packed[-1, -1] = top, lobes, len(lobes)
+        return mi.TensorXf(packed)
 
     def transmittance(self, fraction: mi.Float, cosine: mi.Float, active: mi.Bool | bool = True) -> mi.Float:
         i, u = _cell(fraction, self.rows)
@@ -49,8 +62,28 @@ class Table:
     def hemispherical(self, fraction: mi.Float, active: mi.Bool | bool = True) -> mi.Float:
         return self._row(self._mean, fraction, active)
 
-    def diffuse_gain(self, fraction: mi.Float, active: mi.Bool | bool = True) -> mi.Float:
-        return self._row(self._gain, fraction, active)
+    def lobes(self, cosine: mi.Float, active: mi.Bool | bool = True) -> list[mi.Float]:
+        """The tissue's lobes phi_i at cosines in the guide."""
+        j, v = _cell(cosine, self.columns)
+        return [
+            dr.lerp(dr.gather(mi.Float, lobe, j, active), dr.gather(mi.Float, lobe, j + 1, active), v)
+            for lobe in self._lobes
+        ]
+
+    def diffuse(
+        self, fraction: mi.Float, cos_in: mi.Float, cos_out: mi.Float, active: mi.Bool | bool = True
+    ) -> mi.Float:
+        """Reflectance of tissue that gives light back where it came in, behind the face:
+        sum phi_i(cos_in) K_ij phi_j(cos_out)."""
+        before, after = self.lobes(cos_in, active), self.lobes(cos_out, active)
+        return sum(
+            (
+                before[i] * self._row(self._gain[i * self.modes + j], fraction, active) * after[j]
+                for i in range(self.modes)
+                for j in range(self.modes)
+            ),
+            mi.Float(0.0),
+        )
 
     def draw(
         self, fraction: mi.Float, sample1: mi.Float, sample2: mi.Point2f, active: mi.Bool | bool = True
@@ -106,7 +139,8 @@ def _cell(x: mi.Float, nodes: int) -> tuple[mi.UInt32, mi.Float]:
 
 
 class FrustratedTIR(mi.BSDF):
-    """Mirror reflection 1 - T and a diffuse lobe T(cos_i) T(cos_o) K / pi; reciprocal, and black from behind.
+    """Mirror reflection 1 - T and a diffuse lobe T(cos_i) T(cos_o) K(cos_i, cos_o) / pi; reciprocal, and black
+    from behind.
 
     Properties: `table` (from `Table.pack`), `contact_fraction` (a texture, real contact fraction 0..1). The
     side that the surface normal points to is the guide.
@@ -134,10 +168,10 @@ class FrustratedTIR(mi.BSDF):
     ) -> tuple[mi.BSDFSample3f, mi.Color1f]:
         cos_i = mi.Frame3f.cos_theta(si.wi)
         active = active & (cos_i > 0.0)
-        a, t, gain = self._at(si, cos_i, active)
+        a, t = self._at(si, cos_i, active)
         mirror = mi.Float(1.0 if ctx.is_enabled(mi.BSDFFlags.DeltaReflection, 0) else 0.0) * (1.0 - t)
-        diffuse = mi.Float(1.0 if ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 1) else 0.0) * t * gain
-        albedo = mirror + diffuse * self.table.hemispherical(a, active)
+        diffuse = mi.Float(1.0 if ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 1) else 0.0) * t
+        albedo = mirror + diffuse * self._typical(a, cos_i, active)
         p_mirror = dr.select(albedo > 0.0, mirror / albedo, 0.0)
         is_mirror = sample1 < p_mirror
 
@@ -157,7 +191,7 @@ class FrustratedTIR(mi.BSDF):
         )
         bs.sampled_component = dr.select(is_mirror, mi.UInt32(0), mi.UInt32(1))
         active &= bs.pdf > 0.0
-        value = diffuse * self.table.transmittance(a, cos_spread, active) * cos_spread * dr.inv_pi
+        value = diffuse * self._lobe(a, cos_i, cos_spread, active)
         weight = dr.select(is_mirror, albedo, dr.select(bs.pdf > 0.0, value / bs.pdf, 0.0))
         return bs, mi.Color1f(weight) & active
 
@@ -168,9 +202,8 @@ class FrustratedTIR(mi.BSDF):
         active = active & (cos_i > 0.0) & (cos_o > 0.0)
         if not ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 1):
             return mi.Color1f(0.0)
-        a, t, gain = self._at(si, cos_i, active)
-        value = t * gain * self.table.transmittance(a, cos_o, active) * cos_o * dr.inv_pi
-        return mi.Color1f(value) & active
+        a, t = self._at(si, cos_i, active)
+        return mi.Color1f(t * self._lobe(a, cos_i, cos_o, active)) & active
 
     def pdf(
         self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool | bool = True
@@ -179,9 +212,9 @@ class FrustratedTIR(mi.BSDF):
         active = active & (cos_i > 0.0) & (cos_o > 0.0)
         if not ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 1):
             return mi.Float(0.0)
-        a, t, gain = self._at(si, cos_i, active)
+        a, t = self._at(si, cos_i, active)
         mirror = mi.Float(1.0 if ctx.is_enabled(mi.BSDFFlags.DeltaReflection, 0) else 0.0) * (1.0 - t)
-        albedo = mirror + t * gain * self.table.hemispherical(a, active)
+        albedo = mirror + t * self._typical(a, cos_i, active)
         share = dr.select(albedo > 0.0, 1.0 - mirror / albedo, 0.0)
         return dr.select(active, share * self._density(ctx, a, cos_o, active), 0.0)
 
@@ -200,12 +233,21 @@ class FrustratedTIR(mi.BSDF):
             return self.table.density(a, cosine, active)
         return dr.maximum(cosine, 0.0) * dr.inv_pi
 
-    def _at(
-        self, si: mi.SurfaceInteraction3f, cos_i: mi.Float, active: mi.Bool
-    ) -> tuple[mi.Float, mi.Float, mi.Float]:
+    def _at(self, si: mi.SurfaceInteraction3f, cos_i: mi.Float, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
         a = self.fraction.eval_1(si, active)
         a = dr.select(dr.isfinite(a), a, 0.0)  # slivers at a pressed-back rim have no barycentric coordinates
-        return a, self.table.transmittance(a, cos_i, active), self.table.diffuse_gain(a, active)
+        return a, self.table.transmittance(a, cos_i, active)
+
+    def _lobe(self, a: mi.Float, cos_i: mi.Float, cos_o: mi.Float, active: mi.Bool) -> mi.Float:
+        """What of the light that passed leaves per solid angle, times cosine."""
+        value = self.table.diffuse(a, cos_i, cos_o, active) * self.table.transmittance(a, cos_o, active)
+        return dr.maximum(value, 0.0) * cos_o * dr.inv_pi
+
+    def _typical(self, a: mi.Float, cos_i: mi.Float, active: mi.Bool) -> mi.Float:
+        """About the share of the light that passed that comes back: it only decides how often to follow it."""
+        return dr.maximum(self.table.diffuse(a, cos_i, cos_i, active), 1e-3) * self.table.hemispherical(
+            a, active
+        )
 
     def to_string(self) -> str:
         return f"FrustratedTIR[table = {self.table.rows} x {self.table.columns}]"

@@ -11,9 +11,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import bsdf, pinhole, surface
-from .contact import ContactOptics, contact_fraction, contact_optics
+from . import (
+    bsdf,  # noqa: F401  registers the BSDF
+    pinhole,
+    surface,
+)
+from .contact import ContactOptics, contact_optics, real_contact
 from .sensor import Led, Sensor
+from .tissue import body_behind
 
 _BLACK = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.0}}}
 _OUTWARD = {"+x": (1.0, 0.0), "-x": (-1.0, 0.0), "+y": (0.0, 1.0), "-y": (0.0, -1.0)}
@@ -22,19 +27,21 @@ _WALL_TOP_MM = 0.5  # walls reach above the contact surface, which bulges a litt
 
 def optics_of(sensor: Sensor) -> ContactOptics:
     """The table of the contact's optics for this sensor."""
-    skin, tissue = sensor.skin, sensor.tissue
+    skin = sensor.skin
+    index, body = body_behind(skin, sensor.tissue)
     return contact_optics(
         sensor.guide.refractive_index,
         skin.gap_index,
-        tissue.refractive_index,
-        tissue.albedo,
+        index,
+        body.reflectance,
         skin.rms_height_um,
         sensor.wavelength_nm,
+        dust=skin.dust,
     )
 
 
-def load_scene(sensor: Sensor, optics: ContactOptics) -> mi.Scene:
-    """Load the sensor with a flat, unloaded contact surface.
+def load_scene(sensor: Sensor, table: mi.TensorXf) -> mi.Scene:
+    """Load the sensor with a flat, unloaded contact surface whose optics are `table` (`bsdf.Table.pack`).
 
     The contact surface is the mesh with id `contact`; LED number i is the shape with id `led_i`. Media are
     separated by single faces: guide to air (side walls), guide to glass, glass to air. The glass's rim is
@@ -44,11 +51,11 @@ def load_scene(sensor: Sensor, optics: ContactOptics) -> mi.Scene:
     guide, glass = sensor.guide, sensor.glass
     half, bottom = guide.width_mm / 2, -guide.thickness_mm
     lowest = bottom - glass.thickness_mm
-    side_wall = _dielectric(guide.refractive_index, 1.0)
+    side_wall = _side_wall(sensor)
     scene: dict[str, Any] = {
         "type": "scene",
         "camera": pinhole.describe(sensor),
-        "contact": _contact_mesh(sensor, optics),
+        "contact": _contact_mesh(sensor, table),
         "guide_to_glass": _face(half, bottom, _dielectric(guide.refractive_index, glass.refractive_index)),
         "glass_to_air": _face(half, lowest, _dielectric(glass.refractive_index, 1.0)),
     }
@@ -58,6 +65,16 @@ def load_scene(sensor: Sensor, optics: ContactOptics) -> mi.Scene:
     for number, led in enumerate(sensor.leds):
         scene[f"led_{number}"] = _led(led, half)
     return mi.load_dict(scene, optimize=False)  # merging would lose the walls' names
+
+
+def _side_wall(sensor: Sensor) -> dict[str, Any]:
+    """Polished where LEDs in air shine through: `trace` paints the walls around their windows."""
+    guide = sensor.guide
+    if guide.walls == "polished" or any(led.coupling == "air" for led in sensor.leds):
+        return _dielectric(guide.refractive_index, 1.0)
+    albedo = guide.wall_albedo if guide.walls == "diffuse" else 0.0
+    paint = {"type": "diffuse", "reflectance": {"type": "uniform", "value": albedo}}
+    return {"type": "twosided", "bsdf": paint}
 
 
 def put_surface(scene: mi.Scene, sensor: Sensor, deformed: surface.OpticalSurface) -> None:
@@ -94,14 +111,14 @@ def led_frame(led: Led, half_mm: float) -> tuple[np.ndarray, np.ndarray, np.ndar
     return centre, -outward, tangent
 
 
-def _contact_mesh(sensor: Sensor, optics: ContactOptics) -> mi.Mesh:
+def _contact_mesh(sensor: Sensor, table: mi.TensorXf) -> mi.Mesh:
     start = surface.flat(sensor.guide.width_mm, 0.0)
     shape = surface.triangulate(start)
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict(
         {
             "type": "frustrated_tir",
-            "table": bsdf.Table.pack(optics),
+            "table": table,
             "contact_fraction": {"type": "mesh_attribute", "name": "vertex_contact_fraction"},
         }
     )
@@ -116,10 +133,7 @@ def _contact_mesh(sensor: Sensor, optics: ContactOptics) -> mi.Mesh:
 
 
 def _fraction(sensor: Sensor, deformed: surface.OpticalSurface) -> np.ndarray:
-    skin = sensor.skin
-    fraction = contact_fraction(
-        deformed.pressure_kPa, sensor.effective_modulus_kPa, skin.rms_slope, skin.kappa
-    )
+    fraction = real_contact(deformed.pressure_kPa, sensor.skin, sensor.effective_modulus_kPa)
     return surface.with_skirt(fraction)
 
 

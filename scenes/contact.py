@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.special import erf
 
 from .ftir import gap_transmittance
+from .sensor import Skin
 
 Array = NDArray[np.float64]
 
@@ -26,6 +27,16 @@ def contact_fraction(pressure_kPa: Array, modulus_kPa: float, rms_slope: float, 
     """
     load = np.maximum(np.asarray(pressure_kPa, dtype=np.float64), 0.0)
     return np.asarray(erf(0.5 * np.sqrt(np.pi) * kappa * load / (modulus_kPa * rms_slope)))
+
+
+def real_contact(pressure_kPa: Array, skin: Skin, modulus_kPa: float) -> Array:
+    """Real over apparent contact area of what can touch (the dust's share left out), shape of the pressure.
+
+    "rough" is `contact_fraction`; "full" is 1 wherever there is pressure: adhesion or gel has closed the gaps.
+    """
+    if skin.contact == "full":
+        return np.where(np.asarray(pressure_kPa) > 0.0, 1.0, 0.0)
+    return contact_fraction(pressure_kPa, modulus_kPa, skin.rms_slope, skin.kappa)
 
 
 def mean_gap_um(fraction: Array, rms_height_um: float) -> Array:
@@ -73,20 +84,23 @@ def contact_optics(
     rms_height_um: float,
     wavelength_nm: float,
     *,
+    dust: float = 0.0,
     n_fraction: int = 129,
     n_cos: int = 1025,
 ) -> ContactOptics:
     """Tabulate the optics of a rough contact between guide and a diffusing tissue.
 
     Real contact (gap 0) takes the share A_r, gaps distributed exponentially about `mean_gap_um` the rest; T
-    is averaged over them (T of the mean gap would be wrong: T falls within 100 to 300 nm). What is
-    transmitted is made isotropic in the tissue, of which the share `albedo` comes back to the surface per
+    is averaged over them (T of the mean gap would be wrong: T falls within 100 to 300 nm). The share `dust` of
+    the area stays apart by far more than a wavelength, at any pressure: its T is the mean over all fringes, and
+    nothing tunnels. What is transmitted is made isotropic in the tissue, of which the share `albedo` comes back to the surface per
     pass; the surface sends part of it back down. With T_in the hemispherical transmittance from the tissue
     side, (n1/n3)² times the guide side's by reciprocity, the passes sum to
 
         K = (n1/n3)² albedo / (1 - albedo (1 - T_in)).
 
-    Lateral spread in the tissue, and scattering of the mirror reflection by the roughness, are left out.
+    That is the local limit, with Lambertian light in the tissue; `tissue` has depth and angles. Scattering of the
+    mirror reflection by the roughness is left out.
     """
     fraction = np.linspace(0.0, 1.0, n_fraction)
     cosine = np.linspace(0.0, 1.0, n_cos)
@@ -94,8 +108,10 @@ def contact_optics(
     gaps = mean_gap_um(fraction, rms_height_um)
     apart = _mean_over_gaps(n_guide, n_gap, n_tissue, gaps, cosine, wavelength_nm)
     table = fraction[:, None] * touching + (1.0 - fraction[:, None]) * apart
+    if dust > 0.0:
+        table = (1.0 - dust) * table + dust * _far_apart(n_guide, n_gap, n_tissue, cosine, wavelength_nm)
 
-    hemispherical = 2.0 * table @ _moment_weights(cosine)
+    hemispherical = 2.0 * table @ moment_weights(cosine)
     inside = (n_guide / n_tissue) ** 2 * hemispherical
     gain = (n_guide / n_tissue) ** 2 * albedo / (1.0 - albedo * (1.0 - inside))
     return ContactOptics(table, hemispherical, gain)
@@ -116,6 +132,15 @@ def _mean_over_gaps(
     result = np.zeros((mean_um.size, cosine.size))
     result[:, fringes] = _fringe_mean(n1, n0, n3, mean_um, cosine[fringes], wavelength_nm)
     result[:, tunnels] = _tunnel_mean(n1, n0, n3, mean_um, cosine[tunnels], wavelength_nm)
+    return result
+
+
+def _far_apart(n1: float, n0: float, n3: float, cosine: Array, wavelength_nm: float) -> Array:
+    """T over gaps so wide that nothing tunnels and the fringes are washed out, (n_cos,)."""
+    k2 = n1**2 * (1.0 - cosine**2)
+    fringes = (k2 < n3**2) & (k2 < n0**2)
+    result = np.zeros(cosine.size)
+    result[fringes] = _fringe_mean(n1, n0, n3, np.array([1e6]), cosine[fringes], wavelength_nm)[0]
     return result
 
 
@@ -171,7 +196,7 @@ def _quarter_turn(half_count: int = 30, reach: float = 3.2) -> tuple[Array, Arra
     return 0.25 * np.pi * (1.0 + np.tanh(u)), 0.5 * np.pi * weight
 
 
-def _moment_weights(cosine: Array) -> Array:
+def moment_weights(cosine: Array) -> Array:
     """Weights w: sum(w f) = ∫ f(x) x dx over 0..1, exact for f piecewise linear on the uniform nodes."""
     step = cosine[1] - cosine[0]
     weights = step * cosine

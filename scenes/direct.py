@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .build import led_frame
-from .irradiance import AngularBasis, refine, weigh
+from .irradiance import AngularBasis, weigh
 from .sensor import Sensor
 from .surface import OpticalSurface, heights
 
@@ -45,12 +45,12 @@ class _Path:
     error: mi.Vector2f  # landing point minus target: along the axis, along the side
     derivative: tuple[mi.Float, mi.Float, mi.Float, mi.Float]  # of the landing point: x_y, x_z, y_y, y_z
     etendue: mi.Float  # dp_y dp_z per area of horizontal target plane
+    in_guide: mi.Float  # length, mm
+    in_glass: mi.Float
 
 
 def direct(sensor: Sensor, basis: AngularBasis, deformed: OpticalSurface) -> Array:
-    """Weighted irradiance of the two families, (n_led, count, 2 CELLS, 2 CELLS), W/mm².
-
-    On the grid on which `irradiance.smooth` returns the rest.
+    """Weighted irradiance of the two families, (n_led, count, CELLS, CELLS), W/mm².
 
     From a Lambertian disc of flux F and area A in a medium of index m, the element dA sends F/(pi A m²) dA
     dp_y dp_z, so the irradiance at a target is that times |d(p_y, p_z)/d(x, y)|, the ray's two unknowns being
@@ -92,7 +92,7 @@ def direct(sensor: Sensor, basis: AngularBasis, deformed: OpticalSurface) -> Arr
     total = list(dr.while_loop((number, *total), more, add))[1:]
     dr.eval(total)
     coarse = np.stack([np.asarray(layer).reshape(n_led, CELLS, CELLS) for layer in total], axis=1)
-    return refine(coarse.astype(np.float64) / DISC_POINTS, 2)
+    return coarse.astype(np.float64) / DISC_POINTS
 
 
 @dataclass(frozen=True)
@@ -107,6 +107,7 @@ class _Source:
     inset: mi.Float  # guide between face and disc, 0 if in air
     index: mi.Float
     radius: mi.Float
+    window: mi.Float
     density: mi.Float  # F / (pi m²), W: the disc's area cancels against its mean over points
 
     @staticmethod
@@ -129,6 +130,7 @@ class _Source:
                     inset,
                     medium,
                     lamp.diameter_mm / 2,
+                    lamp.window_mm,
                     density,
                 ]
             )
@@ -176,6 +178,10 @@ def _arrives(
     lit &= dr.abs(path.error.x) + dr.abs(path.error.y) < 1e-2
     entry_z = disc_z - path.entry_z if mirrored else disc_z + path.entry_z
     lit &= (entry_z > -guide.thickness_mm) & (dr.abs(side_y + path.entry_y) < half)
+    if guide.walls != "polished":
+        to_window = mi.Vector2f(source.radius * on_disc.x + path.entry_y, source.radius * on_disc.y)
+        to_window.y += -path.entry_z if mirrored else path.entry_z
+        lit &= (source.gap == 0.0) | (dr.squared_norm(to_window) <= dr.square(source.window))
     tangential2 = dr.square(path.p_y) + dr.square(path.p_z)
     in_air = source.gap > 0.0
     share = dr.select(in_air, 1.0 - _fresnel(mi.Float(1.0), mi.Float(n), tangential2), 1.0)
@@ -183,6 +189,8 @@ def _arrives(
         level2 = dr.square(path.p_x) + dr.square(path.p_y)
         through = 1.0 - _fresnel(mi.Float(n), mi.Float(n_glass), level2)
         share *= dr.square(through) * _fresnel(mi.Float(n_glass), mi.Float(1.0), level2)
+    if guide.absorption_per_mm > 0.0 or glass.absorption_per_mm > 0.0:
+        share *= dr.exp(-guide.absorption_per_mm * path.in_guide - glass.absorption_per_mm * path.in_glass)
     # the surface's slope turns its normal and lengthens its shadow
     d_x = path.p_x * source.axis_x + path.p_y * dr.abs(source.axis_y)
     d_y = path.p_x * source.axis_y + path.p_y * dr.abs(source.axis_x)
@@ -214,18 +222,21 @@ def _follow(
     px_y, px_z = -(p_y * py_y + p_z * pz_y) / p_x, -(p_y * py_z + p_z * pz_z) / p_x
 
     run = (up - source.gap * t_z) / p_z  # length over index, inside the guide
+    in_guide, in_glass = n * run, mi.Float(0.0)
     run_y, run_z = -run * pz_y / p_z, -run * pz_z / p_z - source.gap / p_z
     if through_glass > 0.0:
         g2 = dr.maximum(n_glass**2 - n**2 + dr.square(p_z), 1e-9)
         below = through_glass * dr.rsqrt(g2)
         factor = -below * p_z / g2
+        in_glass = n_glass * below
         run, run_y, run_z = run + below, run_y + factor * pz_y, run_z + factor * pz_z
 
     x_y, x_z = px_y * run + p_x * run_y, px_z * run + p_x * run_z
     y_y, y_z = source.gap + py_y * run + p_y * run_y, py_z * run + p_y * run_z
     error = mi.Vector2f(p_x * run - along_axis, source.gap * t_y + p_y * run - along_side)
     etendue = dr.square(source.index / one) / dr.abs(x_y * y_z - x_z * y_y)
-    return _Path(p_y, p_z, p_x, source.gap * t_y, source.gap * t_z, error, (x_y, x_z, y_y, y_z), etendue)
+    derivative, entry = (x_y, x_z, y_y, y_z), (source.gap * t_y, source.gap * t_z)
+    return _Path(p_y, p_z, p_x, *entry, error, derivative, etendue, in_guide, in_glass)
 
 
 def _fresnel(n_in: mi.Float, n_out: mi.Float, tangential2: mi.Float) -> mi.Float:

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from .bsdf import Table
 from .build import radiance
-from .irradiance import AngularBasis, land
+from .irradiance import look_up
 from .sensor import Sensor
+from .tissue import Coupling
 from .view import PixelRays, faces_reflectance
 
 _STEP_MM = 1e-3  # off a face before looking on
@@ -31,19 +32,22 @@ class Sight:
     ----------
     position_mm : (rows, columns, 2)
         Point of the deformed surface that each pixel sees directly.
-    points : list of (x, y, fraction, gain)
-        For each sight, on the device: position in units of the guide's width (0..1), real contact fraction,
-        and radiance at the camera per transmitted irradiance, 1/sr.
+    points : list of (x, y, gains)
+        For each sight, on the device: position in units of the guide's width (0..1), and radiance at the
+        camera per light that goes up in the tissue in each mode, 1/sr.
+    windows : (sights, rows, columns)
+        Radiance at the camera over that in the guide, for each sight.
     lamps : (n_led, rows, columns)
         Radiance at the camera, W mm⁻² sr⁻¹, of LEDs in sight: embedded ones, straight or mirrored.
     """
 
     position_mm: NDArray[np.float32]
-    points: list[tuple[mi.Float, mi.Float, mi.Float, mi.Float]]
+    points: list[tuple[mi.Float, mi.Float, list[mi.Float]]]
+    windows: NDArray[np.float32]
     lamps: NDArray[np.float32]
 
 
-def look(scene: mi.Scene, sensor: Sensor, table: Table, rays: PixelRays) -> Sight:
+def look(scene: mi.Scene, sensor: Sensor, table: Table, coupling: Coupling, rays: PixelRays) -> Sight:
     """Intersect the pixels' rays with the deformed surface."""
     guide = sensor.guide
     shape = rays.transmittance.shape
@@ -54,34 +58,39 @@ def look(scene: mi.Scene, sensor: Sensor, table: Table, rays: PixelRays) -> Sigh
     contact = next(shape for shape in scene.shapes() if shape.id() == "contact")
 
     named = {shape.id(): mi.ShapePtr(shape) for shape in scene.shapes()}
+    # the run in the glass and back, near the axis, as one in the guide
+    in_glass = 2.0 * sensor.glass.thickness_mm * guide.refractive_index / sensor.glass.refractive_index
     lamps = [mi.Float(0.0) for _ in sensor.leds]
-    points = []
+    points, windows = [], []
     start = mi.Point3f(*origin) + _STEP_MM / direction.z * direction
     for _ in range(_SIGHTS):
         si = _meet(scene, named["contact"], start, direction)
         seen = si.is_valid() & (si.shape == named["contact"])
         _add_lamps(lamps, si, gain, sensor, named)
+        windows.append(gain)
         cosine = mi.Frame3f.cos_theta(si.wi)
         fraction = dr.select(seen, contact.eval_attribute_1("vertex_contact_fraction", si, seen), 0.0)
         transmitted = table.transmittance(fraction, cosine, seen)
-        emitted = dr.select(seen, gain * transmitted * table.diffuse_gain(fraction, seen) * dr.inv_pi, 0.0)
-        points.append((si.p.x / guide.width_mm + 0.5, si.p.y / guide.width_mm + 0.5, fraction, emitted))
+        emitted = dr.select(seen, gain * transmitted * (coupling.scale * dr.inv_pi), 0.0)
+        gains = [emitted * lobe for lobe in table.lobes(cosine, seen)]
+        points.append((si.p.x / guide.width_mm + 0.5, si.p.y / guide.width_mm + 0.5, gains))
         # mirrored in the contact surface, down, mirrored in the lower faces, up again; the slope left out
         gain = dr.select(seen, gain * (1.0 - transmitted), 0.0)
         down = mi.Vector3f(direction.x, direction.y, -direction.z)
         below = scene.ray_intersect(mi.Ray3f(si.p + _STEP_MM * down, down), seen)
         _add_lamps(lamps, below, gain, sensor, named)
         gain = dr.select(below.shape == named["guide_to_glass"], gain * mirrored, 0.0)
-        run = (si.p.z + guide.thickness_mm) / direction.z
+        run = (si.p.z + guide.thickness_mm + in_glass) / direction.z
         start = mi.Point3f(si.p.x, si.p.y, -guide.thickness_mm) + mi.Vector3f(
             run * direction.x, run * direction.y, 0.0
         )
         start += _STEP_MM / direction.z * direction
-    dr.eval(points, lamps)
+    dr.eval(points, windows, lamps)
     x, y = (np.asarray(points[0][i]).reshape(shape) for i in (0, 1))
     position = (np.stack([x, y], axis=-1) - 0.5) * guide.width_mm
     layers = np.stack([np.broadcast_to(np.asarray(layer), x.size).reshape(shape) for layer in lamps])
-    return Sight(position.astype(np.float32), points, layers)
+    through = np.stack([np.asarray(window).reshape(shape) for window in windows])
+    return Sight(position.astype(np.float32), points, through, layers)
 
 
 def _meet(
@@ -109,16 +118,18 @@ def _add_lamps(
         lamps[number] += dr.select(meets, gain * radiance(led), 0.0)
 
 
-def picture(sight: Sight, basis: AngularBasis, irradiance: NDArray[np.float64]) -> NDArray[np.float32]:
+def picture(sight: Sight, upward: NDArray[np.float64]) -> NDArray[np.float32]:
     """Radiance in air at the pixels, (n_led, rows, columns), in W m⁻² sr⁻¹.
 
-    `irradiance` (n_led, count, m, m), W/mm², smoothed, on cells [iy, ix] of the guide's face.
+    `upward` (n_led, modes, m, m), W/mm², is the light that goes up in the tissue, on cells [iy, ix] of the
+    guide's face.
     """
-    n_led = irradiance.shape[0]
+    n_led, modes = upward.shape[:2]
     total = [mi.Float(0.0) for _ in range(n_led)]
-    for x, y, fraction, gain in sight.points:
-        landed = land(basis, irradiance, x, y, fraction)
-        total = [sum_ + gain * part for sum_, part in zip(total, landed, strict=True)]
+    for x, y, gains in sight.points:
+        layers = look_up(upward.reshape(n_led * modes, *upward.shape[2:]), x, y)
+        for led in range(n_led):
+            total[led] += sum(gain * layers[led * modes + i] for i, gain in enumerate(gains))
     dr.eval(total)
     shape = (n_led, *sight.position_mm.shape[:2])
     layers = np.stack([np.asarray(layer) for layer in total]).reshape(shape)

@@ -24,13 +24,14 @@ _RIM_CELLS = 2  # 0.5 mm
 
 @dataclass(frozen=True)
 class AngularBasis:
-    """Separable form of the contact's transmittance, T(A_r, cos) = sum_k rows[:, k](A_r) columns[k](cos).
+    """Separable form of what enters the tissue, phi_i(cos) T(A_r, cos) = sum_k rows[i, :, k](A_r) columns[k](cos).
 
-    Light arrives spread over angles, so T cannot be taken out of the integral over them; with this form the
-    integral is `count` irradiances, smooth over the surface, whatever the pressure does from pixel to pixel.
+    Light arrives spread over angles, so T and the tissue's lobes phi_i cannot be taken out of the integral
+    over them; with this form the integral is `count` irradiances, smooth over the surface, whatever the
+    pressure does.
     """
 
-    rows: Array  # (n_fraction, count)
+    rows: Array  # (modes, n_fraction, count)
     columns: Array  # (count, n_cos)
 
     @property
@@ -38,14 +39,16 @@ class AngularBasis:
         return self.columns.shape[0]
 
 
-def angular_basis(optics: ContactOptics, tolerance: float = 5e-5) -> AngularBasis:
-    """Truncated singular value decomposition of the table, largest error at most `tolerance`."""
-    u, s, v = np.linalg.svd(optics.transmittance, full_matrices=False)
+def angular_basis(optics: ContactOptics, lobes: Array, tolerance: float = 5e-5) -> AngularBasis:
+    """Truncated singular value decomposition, largest error at most `tolerance`; lobes (modes, n_cos) on the
+    table's cosines."""
+    products = (lobes[:, None] * optics.transmittance).reshape(-1, lobes.shape[1])
+    u, s, v = np.linalg.svd(products, full_matrices=False)
     for count in range(1, s.size + 1):
         rows, columns = u[:, :count] * s[:count], v[:count]
-        if np.abs(rows @ columns - optics.transmittance).max() <= tolerance:
+        if np.abs(rows @ columns - products).max() <= tolerance:
             break
-    return AngularBasis(rows, columns)
+    return AngularBasis(rows.reshape(len(lobes), -1, count), columns)
 
 
 def weigh(weights: mi.Float, count: int, n_cos: int, cosine: mi.Float, active: mi.Bool) -> list[mi.Float]:
@@ -58,30 +61,26 @@ def weigh(weights: mi.Float, count: int, n_cos: int, cosine: mi.Float, active: m
     return [dr.lerp(a, b, share) for a, b in zip(low, high, strict=True)]
 
 
-def land(
-    basis: AngularBasis, irradiance: Array, x: mi.Float, y: mi.Float, fraction: mi.Float
-) -> list[mi.Float]:
-    """Irradiance that enters the tissue, W/mm², from each LED at points with a real contact fraction.
+def look_up(maps: Array, x: mi.Float, y: mi.Float) -> list[mi.Float]:
+    """Values of maps (n, m, m), on cells [iy, ix] of the guide's face, at x and y in units of its width."""
+    layers = np.ascontiguousarray(np.moveaxis(maps, 0, -1), dtype=np.float32)
+    return list(mi.Texture2f(mi.TensorXf(layers), wrap_mode=dr.WrapMode.Clamp).eval(mi.Point2f(x, y)))
 
-    `irradiance` (n_led, count, m, m) on cells [iy, ix] of the guide's face; x and y in units of its width.
-    """
-    n_led, count = irradiance.shape[:2]
-    maps = np.moveaxis(irradiance.reshape(n_led * count, *irradiance.shape[2:]), 0, -1)
-    texture = mi.Texture2f(
-        mi.TensorXf(np.ascontiguousarray(maps, dtype=np.float32)), wrap_mode=dr.WrapMode.Clamp
-    )
-    rows = mi.Float(np.ascontiguousarray(basis.rows, dtype=np.float32).ravel())
-    last = basis.rows.shape[0] - 1
-    node = dr.minimum(mi.UInt32(fraction * last), last - 1)
-    share = fraction * last - mi.Float(node)
-    values = texture.eval(mi.Point2f(x, y))
-    total = [mi.Float(0.0) for _ in range(n_led)]
-    for k in range(count):
-        low, high = (dr.gather(mi.Float, rows, (node + i) * count + k) for i in (0, 1))
-        weight = dr.lerp(low, high, share)
-        for led in range(n_led):
-            total[led] += weight * values[led * count + k]
-    return total
+
+def transmitted(basis: AngularBasis, irradiance: Array, fraction: Array) -> Array:
+    """Irradiance that enters the tissue in each mode, (n, modes, m, m) W/mm², of (n, count, m, m), where the
+    real contact fraction is (m, m)."""
+    rows = np.moveaxis(basis.rows, 0, 1)
+    return np.einsum("yxik,nkyx->niyx", by_fraction(rows, fraction), irradiance, optimize=True)
+
+
+def by_fraction(rows: Array, fraction: Array) -> Array:
+    """Rows (n_fraction, ...) of a table, uniform on 0..1, at fractions (m, m): (m, m, ...)."""
+    last = len(rows) - 1
+    at = np.clip(fraction, 0.0, 1.0) * last
+    node = np.minimum(at.astype(np.int64), last - 1)
+    share = (at - node).reshape(*fraction.shape, *(1,) * (rows.ndim - 1))
+    return np.asarray(rows[node] * (1.0 - share) + rows[node + 1] * share)
 
 
 def smooth(irradiance: Array, factor: int = 4) -> Array:
@@ -91,11 +90,6 @@ def smooth(irradiance: Array, factor: int = 4) -> Array:
     at the rim, where the surface bends and light changes from cell to cell: those cells keep their values.
     """
     return _along_both(_smoothing_matrix(irradiance.shape[-1], factor, _SMOOTHING_CELLS), irradiance)
-
-
-def refine(irradiance: Array, factor: int) -> Array:
-    """Values on a grid `factor` times finer over the last two axes, linear in between."""
-    return _along_both(_smoothing_matrix(irradiance.shape[-1], factor, 0.0), irradiance)
 
 
 def _along_both(step: Array, irradiance: Array) -> Array:

@@ -88,6 +88,11 @@ class Led:
             object.__setattr__(self, "flux_W", self.flux_lm / per_watt)
 
     @property
+    def window_mm(self) -> float:
+        """Radius of the window before this LED in a painted wall: light from its rim gets in at 45°."""
+        return self.diameter_mm / 2 + self.gap_mm
+
+    @property
     def lumens_per_watt(self) -> float | None:
         """Lumens per watt of its spectrum; None where the spectrum lacks its numbers."""
         needs = {"line": (self.peak_nm,), "gaussian": (self.peak_nm, self.fwhm_nm)}.get(self.spectrum, ())

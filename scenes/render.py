@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from . import backend, surface, view
+from . import backend, spread, surface, tissue, view
 from .sensor import NotModelled, Sensor
 
 if TYPE_CHECKING:
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
 Quality = Literal["preview", "standard", "reference"]
 
 PATHS_PER_LED = {"preview": 2**17, "standard": 2**22}
-"""Light paths that the traced qualities spend on each LED; "reference" has samples per pixel instead."""
+"""Light paths that the qualities spend on each LED; "reference" has its own."""
 
 _PATHS_PER_PASS = 2**20  # independent passes bound the memory and tell the noise
-_MOST_PASSES = 64  # so that seeds of passes do not meet
+_MOST_PASSES = 4096  # so that seeds of passes do not meet
 
-REFERENCE_SAMPLES = 4096
-"""Samples per pixel of a reference picture."""
+REFERENCE_SAMPLES = 2**24
+"""Light paths per LED of a reference picture."""
 
 
 @dataclass(frozen=True)
@@ -65,17 +65,22 @@ class Renderer:
         """Load the scene on `device` ("auto", "cpu" or "cuda"; see `backend.use`)."""
         backend.use(device)
         # only now: Mitsuba's classes bind to the variant that is active when they are defined
-        from . import build
+        from . import build, transport
         from .bsdf import Table
         from .irradiance import angular_basis
 
         self.sensor = sensor
         self.rays = view.pixel_rays(sensor)
+        guide = sensor.guide
         with threadpool_limits(1):  # linear algebra on several threads sums in another order
             optics = build.optics_of(sensor)
-            self.basis = angular_basis(optics)
-        self.table = Table(Table.pack(optics))
-        self.scene = build.load_scene(sensor, optics)
+            index, body = tissue.body_behind(sensor.skin, sensor.tissue)
+            coupling = tissue.couple(optics, body, guide.refractive_index, index)
+            spreads = spread.spreader(body, coupling, guide.width_mm, transport.GRID)
+            self.basis = angular_basis(optics, coupling.lobes)
+        self.behind = transport.Behind(coupling, spreads)
+        self.table = Table(Table.pack(optics, coupling))
+        self.scene = build.load_scene(sensor, Table.pack(optics, coupling))
 
     def render(
         self,
@@ -96,12 +101,12 @@ class Renderer:
         field
             "pressure", or "pressure_0" for the press without inclusion (and `displacement_0` with it).
         quality
-            "preview" and "standard" trace light from the LEDs; "reference" is stock `path` through the real
-            scene: hours.
+            "preview" and "standard" trace light from the LEDs and spread it in the tissue on a grid;
+            "reference" follows every ray through guide and tissue: minutes.
         seed
             Seed of the light. The same seed gives the same bytes, whatever the number of threads.
         samples
-            Light paths per LED, or per pixel for "reference", instead of the quality's own number.
+            Light paths per LED, instead of the quality's own number.
         progress
             Called with the finished share, 0 to 1.
         """
@@ -113,9 +118,9 @@ class Renderer:
         tell = progress or (lambda done: None)
         shape = surface.resample(pressed, self.sensor.guide.width_mm, suffix=field.removeprefix("pressure"))
         build.put_surface(self.scene, self.sensor, shape)
-        sight = gather.look(self.scene, self.sensor, self.table, self.rays)
+        sight = gather.look(self.scene, self.sensor, self.table, self.behind.coupling, self.rays)
         if quality == "reference":
-            radiance, noise = self._reference(samples or REFERENCE_SAMPLES, seed, tell)
+            radiance, noise = self._reference(sight, samples or REFERENCE_SAMPLES, seed, tell)
         else:
             self._check_leds(shape)
             radiance, noise = self._traced(shape, sight, samples or PATHS_PER_LED[quality], seed, tell)
@@ -126,7 +131,7 @@ class Renderer:
 
     def _check_leds(self, shape: surface.OpticalSurface) -> None:
         """Refuse LEDs that the deformed rim would shade: the gathered light knows no shade."""
-        lowest = float(shape.displacement_mm[..., 2].min())
+        lowest = float((shape.rest_mm + shape.displacement_mm[..., 2]).min())
         for number, led in enumerate(self.sensor.leds):
             if led.z_mm + led.diameter_mm / 2 > lowest:
                 allowed = (
@@ -142,25 +147,26 @@ class Renderer:
         seed: int,
         tell: Callable[[float], None],
     ) -> tuple[NDArray[np.float32], float]:
-        from . import direct, gather, irradiance, trace
+        from . import direct, gather, transport
 
-        with threadpool_limits(1):
-            straight = direct.direct(self.sensor, self.basis, shape)
+        straight = direct.direct(self.sensor, self.basis, shape)
+        ground = transport.survey(self.scene, self.sensor)
         passes = max(2, -(-samples // _PATHS_PER_PASS))
         runs = []
         for number in range(passes):
-            landed = trace.trace(
-                self.scene,
-                self.sensor,
-                self.table,
-                self.basis,
-                straight,
-                max(samples // passes, 2),
-                seed * _MOST_PASSES + number,
-            )
             with threadpool_limits(1):
-                light = straight + irradiance.smooth(landed)
-            runs.append(gather.picture(sight, self.basis, light))
+                light = transport.transport(
+                    self.scene,
+                    self.sensor,
+                    self.table,
+                    self.basis,
+                    self.behind,
+                    ground,
+                    straight,
+                    max(samples // passes, 2),
+                    seed * _MOST_PASSES + number,
+                )
+            runs.append(gather.picture(sight, light.upward))
             tell((number + 1) / passes)
         # the smoothing kernel has negative sides: next to an edge of light they may undershoot the dark
         radiance = np.maximum(np.mean(runs, axis=0, dtype=np.float64), 0.0)
@@ -170,24 +176,31 @@ class Renderer:
         return radiance.astype(np.float32), float(100.0 * relative)
 
     def _reference(
-        self, samples: int, seed: int, tell: Callable[[float], None]
+        self, sight: Sight, samples: int, seed: int, tell: Callable[[float], None]
     ) -> tuple[NDArray[np.float32], float]:
-        from . import build, reference
+        from . import exact, transport
 
-        layers, variance = [], np.zeros(self.rays.transmittance.shape)
-        count = len(self.sensor.leds)
-        for led in range(count):
-            build.light_only(self.scene, self.sensor, led)
-            mean, error = reference.path_trace(
+        ground = transport.survey(self.scene, self.sensor)
+        each = max(_PATHS_PER_PASS // len(self.sensor.leds), 1)
+        passes = max(2, -(-samples // each))
+        total, squares = None, None
+        for number in range(passes):
+            seen = exact.exact(
                 self.scene,
                 self.sensor,
-                samples,
-                seed * count + led,
-                progress=lambda done, led=led: tell((led + done) / count),  # type: ignore[misc]
+                self.table,
+                self.rays,
+                ground.fraction,
+                -(-samples // passes),
+                seed * _MOST_PASSES + number,
             )
-            layers.append(mean.astype(np.float32))
-            variance = variance + error**2
-        build.light_only(self.scene, self.sensor, None)
-        radiance = np.stack(layers)
-        relative = np.sqrt(np.mean(variance)) / max(np.mean(radiance.sum(axis=0)), 1e-30)
-        return radiance, float(100.0 * relative)
+            layers = 1e6 * (np.einsum("snyx,syx->nyx", seen, sight.windows) + sight.lamps)
+            whole = layers.sum(axis=0)
+            total = layers if total is None else total + layers
+            squares = whole**2 if squares is None else squares + whole**2
+            tell((number + 1) / passes)
+        assert total is not None and squares is not None
+        mean = total / passes
+        whole = mean.sum(axis=0)
+        spread2 = np.maximum(squares / passes - whole**2, 0.0) / (passes - 1)
+        return mean.astype(np.float32), float(100.0 * np.sqrt(spread2.mean()) / max(whole.mean(), 1e-30))

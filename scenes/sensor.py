@@ -1,4 +1,4 @@
-"""The sensor as light sees it: guide, glass, LEDs, camera, skin and tissue (no Mitsuba here).
+"""The sensor as light sees it: guide, glass, LEDs, camera, skin, sheet and tissue (no Mitsuba here).
 
 Frame: the origin is the centre of the undeformed contact surface and +z points into the specimen, so the
 guide fills ``-thickness_mm <= z <= 0``, the glass lies below it and the camera's pinhole below the glass.
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
@@ -21,6 +21,8 @@ from .led import Led, Side, led_conflicts
 from .quantity import CONFIG, Conflict, Length, RefractiveIndex, Wavelength
 
 __all__ = [
+    "Absorption",
+    "Anisotropy",
     "Camera",
     "Conflict",
     "Glass",
@@ -28,16 +30,34 @@ __all__ = [
     "Led",
     "NotModelled",
     "RefractiveIndex",
+    "Scattering",
     "Sensor",
+    "Sheet",
     "Side",
     "Skin",
     "Tissue",
+    "Walls",
     "conflicts",
 ]
+
+Walls = Literal["polished", "absorbing", "diffuse"]
+ContactState = Literal["rough", "full"]
+Scattering = Annotated[float, Field(ge=0.01, le=1000.0)]
+SheetScattering = Annotated[float, Field(ge=0.0, le=1000.0)]
+Absorption = Annotated[float, Field(ge=0.0, le=1000.0)]
+Anisotropy = Annotated[float, Field(ge=-0.9, le=0.99)]
+
+_SCATTERING = "Reduced scattering coefficient µs' = (1 - g) µs of the {}, 1/mm."
+_ABSORPTION = "Absorption coefficient µa of the {}, 1/mm."
+_ANISOTROPY = "Mean cosine g of one scattering; only the volumetric reference uses it."
 
 
 class NotModelled(ValueError):
     """A sensor or a press that the optics cannot show rightly yet; the message is one line."""
+
+
+MIN_EXTINCTION = 0.01
+"""Least scattering and absorption together of a contact sheet, 1/mm."""
 
 
 @dataclass(frozen=True, config=CONFIG)
@@ -49,6 +69,19 @@ class Guide:
     refractive_index: Annotated[
         RefractiveIndex, Field(description="Refractive index of the guide at the light's wavelength.")
     ] = 1.4336
+    absorption_per_mm: Annotated[
+        Absorption, Field(description="Absorption coefficient of the guide, 1/mm (PDMS: about 0.001).")
+    ] = 0.0
+    walls: Annotated[
+        Walls,
+        Field(
+            description="Side faces: polished; or painted, but for windows before LEDs in air: absorbing, "
+            "or diffuse (white)."
+        ),
+    ] = "polished"
+    wall_albedo: Annotated[
+        float, Field(ge=0.0, le=1.0, description="Share of light that diffuse walls send back, 0 to 1.")
+    ] = 0.9
 
 
 @dataclass(frozen=True, config=CONFIG)
@@ -63,6 +96,9 @@ class Glass:
         Glassware | None,
         Field(description="Glass whose index over wavelength takes the place of refractive_index."),
     ] = None
+    absorption_per_mm: Annotated[
+        Absorption, Field(description="Absorption coefficient of the plate, 1/mm.")
+    ] = 0.0
 
     def at(self, wavelength_nm: float) -> Glass:
         """Return the plate as light of this wavelength sees it."""
@@ -72,8 +108,35 @@ class Glass:
 
 
 @dataclass(frozen=True, config=CONFIG)
+class Sheet:
+    """A compliant sheet on the guide: the light gets no farther, the tissue presses from behind.
+
+    The roughness is that of `Skin`. Its stiffness counts in the contact of the rough faces only; the press
+    itself leaves it out, which is right for sheets that are thin beside the inclusion's depth.
+    """
+
+    thickness_mm: Annotated[float, Field(ge=0.02, le=50.0, description="Thickness of the sheet, mm.")]
+    modulus_kPa: Annotated[
+        float,
+        Field(
+            ge=1e-3, le=1e7, description="Young's modulus of the sheet, kPa; enters the rough contact only."
+        ),
+    ]
+    poisson: Annotated[
+        float, Field(ge=0.0, le=0.4999, description="Poisson's ratio of the sheet, up to 0.4999.")
+    ] = 0.49
+    refractive_index: Annotated[RefractiveIndex, Field(description="Refractive index of the sheet.")] = 1.41
+    scattering_per_mm: Annotated[SheetScattering, Field(description=_SCATTERING.format("sheet"))] = 10.0
+    absorption_per_mm: Annotated[Absorption, Field(description=_ABSORPTION.format("sheet"))] = 0.01
+    backing: Annotated[
+        float,
+        Field(ge=0.0, le=1.0, description="Reflectance of what lies behind the sheet, 0 (black) to 1."),
+    ] = 0.0
+
+
+@dataclass(frozen=True, config=CONFIG)
 class Skin:
-    """Rough contact between guide and tissue: how pressure turns into real contact and air gaps."""
+    """The contact between guide and tissue: how pressure turns into real contact and gaps."""
 
     rms_slope: Annotated[
         float,
@@ -102,26 +165,39 @@ class Skin:
     gap_index: Annotated[
         float,
         Field(
-            ge=1.0, le=4.0, description="Refractive index of what fills the gaps: 1 for air, 1.33 for water."
+            ge=1.0,
+            le=4.0,
+            description="Refractive index of what fills the gaps: 1 for air, 1.33 for water or gel.",
         ),
     ] = 1.0
+    contact: Annotated[
+        ContactState,
+        Field(
+            description="rough: real contact grows with pressure; full: wherever it is pressed (adhesion, gel)."
+        ),
+    ] = "rough"
+    dust: Annotated[
+        float,
+        Field(ge=0.0, le=1.0, description="Share of the area that never touches, as under talc, 0 to 1."),
+    ] = 0.0
+    sheet: Annotated[
+        Sheet | None,
+        Field(
+            description="A sheet on the guide that the light enters in the tissue's place; none if absent."
+        ),
+    ] = None
 
 
 @dataclass(frozen=True, config=CONFIG)
 class Tissue:
-    """The specimen's surface, as light sees it."""
+    """The specimen, as light sees it: it scatters in depth."""
 
     refractive_index: Annotated[RefractiveIndex, Field(description="Refractive index of the specimen.")] = (
         1.40
     )
-    albedo: Annotated[
-        float,
-        Field(
-            ge=0.0,
-            lt=1.0,
-            description="Share of the light that enters the specimen and comes back out, 0 to 1.",
-        ),
-    ] = 0.68
+    scattering_per_mm: Annotated[Scattering, Field(description=_SCATTERING.format("tissue"))] = 1.0
+    absorption_per_mm: Annotated[Absorption, Field(description=_ABSORPTION.format("tissue"))] = 0.02
+    anisotropy: Annotated[Anisotropy, Field(description=_ANISOTROPY)] = 0.0
 
 
 @dataclass(frozen=True, config=CONFIG)
@@ -161,4 +237,10 @@ def conflicts(guide: Guide, leds: tuple[Led, ...], camera: Camera, skin: Skin) -
             "skin.gap_index",
             skin.gap_index,
             f"a number below the guide's index {guide.refractive_index:g} (else no light is trapped)",
+        )
+    if skin.sheet and skin.sheet.scattering_per_mm + skin.sheet.absorption_per_mm < MIN_EXTINCTION:
+        yield Conflict(
+            "skin.sheet.scattering_per_mm",
+            skin.sheet.scattering_per_mm,
+            f"with the absorption at least {MIN_EXTINCTION:g} per mm (clear sheets are part of the guide)",
         )

@@ -29,11 +29,14 @@ class OpticalSurface:
         Displacement at [iy, ix], mm, +z into the specimen, glass at rest.
     pressure_kPa : (n, n)
         Contact pressure at [iy, ix], kPa.
+    rest_mm : (n, n)
+        Height z of the undeformed surface at [iy, ix], mm: 0 if it is flat.
     """
 
     nodes_mm: Array
     displacement_mm: Array
     pressure_kPa: Array
+    rest_mm: Array
 
 
 def resample(
@@ -70,11 +73,10 @@ def resample(
         )
 
     line = np.linspace(-half, half, nodes)
-    fields = np.column_stack(
-        [surface.point_data[f"displacement{suffix}"], surface.point_data[f"pressure{suffix}"]]
-    )
+    names = (f"displacement{suffix}", f"pressure{suffix}")
+    fields = np.column_stack([*(surface.point_data[name] for name in names), surface.points[:, 2]])
     values = _interpolate(points, fields, line)
-    return OpticalSurface(line, values[..., :3], values[..., 3])
+    return OpticalSurface(line, values[..., :3], values[..., 3], values[..., 4])
 
 
 def _interpolate(points: Array, fields: Array, line: Array) -> Array:
@@ -96,7 +98,8 @@ def _interpolate(points: Array, fields: Array, line: Array) -> Array:
 def flat(width_mm: float, pressure_kPa: float, *, nodes: int = NODES) -> OpticalSurface:
     """An undeformed surface under uniform pressure."""
     line = np.linspace(-width_mm / 2, width_mm / 2, nodes)
-    return OpticalSurface(line, np.zeros((nodes, nodes, 3)), np.full((nodes, nodes), float(pressure_kPa)))
+    still = np.zeros((nodes, nodes, 3))
+    return OpticalSurface(line, still, np.full((nodes, nodes), float(pressure_kPa)), still[..., 2])
 
 
 def triangulate(surface: OpticalSurface) -> trimesh.Trimesh:
@@ -107,7 +110,7 @@ def triangulate(surface: OpticalSurface) -> trimesh.Trimesh:
     """
     lines = surface.nodes_mm
     x, y = np.meshgrid(lines, lines)
-    position = np.stack([x, y, np.zeros_like(x)], axis=-1) + surface.displacement_mm
+    position = np.stack([x, y, surface.rest_mm], axis=-1) + surface.displacement_mm
     position = np.pad(position, ((1, 1), (1, 1), (0, 0)), mode="edge")
     # rising, so that no triangle degenerates: 0.1 µm is the least at which single precision still tells
     # where in a triangle a point lies
@@ -137,7 +140,22 @@ def _faces(n: int) -> NDArray[np.int64]:
 def at(
     surface: OpticalSurface, position_mm: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Pressure, kPa, and displacement along z, mm, at deformed positions (..., 2) mm; shape (...).
+    """Pressure, kPa, and displacement along z, mm, at deformed positions (..., 2) mm; shape (...)."""
+    fields = np.stack([surface.pressure_kPa, surface.displacement_mm[..., 2]])
+    pressure, displacement_z = _at(surface, fields, np.asarray(position_mm, dtype=np.float64))
+    return pressure.astype(np.float32), displacement_z.astype(np.float32)
+
+
+def heights(surface: OpticalSurface, line_mm: Array) -> Array:
+    """Height z, mm, of the deformed surface at [iy, ix] of the grid of deformed coordinates `line_mm`
+    (m,)."""
+    x, y = np.meshgrid(line_mm, line_mm)
+    fields = (surface.rest_mm + surface.displacement_mm[..., 2])[None]
+    return np.asarray(_at(surface, fields, np.stack([x, y], axis=-1))[0])
+
+
+def _at(surface: OpticalSurface, fields: Array, target: Array) -> Array:
+    """Fields (k, n, n) at deformed positions (..., 2) mm, (k, ...).
 
     The undeformed point of each position is found by fixed-point iteration, which contracts by the strain (a
     few per cent).
@@ -149,19 +167,8 @@ def at(
         index = (points[..., ::-1] - line[0]) / step
         return np.asarray(map_coordinates(values, np.moveaxis(index, -1, 0), order=1, mode="nearest"))
 
-    target = np.asarray(position_mm, dtype=np.float64)
     undeformed = target
     for _ in range(4):
         shift = np.stack([look_up(surface.displacement_mm[..., i], undeformed) for i in (0, 1)], axis=-1)
         undeformed = target - shift
-    pressure = look_up(surface.pressure_kPa, undeformed)
-    return pressure.astype(np.float32), look_up(surface.displacement_mm[..., 2], undeformed).astype(
-        np.float32
-    )
-
-
-def heights(surface: OpticalSurface, line_mm: Array) -> Array:
-    """Height z, mm, of the deformed surface at [iy, ix] of the grid of deformed coordinates `line_mm`
-    (m,)."""
-    x, y = np.meshgrid(line_mm, line_mm)
-    return at(surface, np.stack([x, y], axis=-1).astype(np.float32))[1].astype(np.float64)
+    return np.stack([look_up(values, undeformed) for values in fields])

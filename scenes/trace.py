@@ -1,12 +1,14 @@
-"""Light traced from the LEDs: how much of it, and at what angles, arrives where on the contact surface.
+"""Light followed through the sensor, which the contact surface mirrors: what it leaves where, and its end.
 
-Two families of paths are left out because `direct` gathers them without noise: straight from the LED to the
-surface, and mirrored once in the glass's lower face.
+A walk does not enter the tissue. At the contact surface the transmitted part is counted on a grid and the
+mirrored part goes on, as weight; `transport` turns what was counted into light that comes back.
 
 Import only after a variant is set (`scenes.backend.use`).
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -15,109 +17,105 @@ from numpy.typing import NDArray
 
 from .bsdf import Table
 from .build import led_frame
-from .irradiance import AngularBasis, land, weigh
+from .irradiance import AngularBasis, look_up, weigh
 from .sensor import Sensor
+from .tissue import Coupling
 
 Array = NDArray[np.float64]
 
 CELLS = 100  # of the irradiance grid, per side
+SINKS = ("tissue", "guide", "glass", "walls", "frame", "leds", "below", "aside")
+"""Where light ends: enters the tissue; absorbed in guide, glass, by painted walls, the glass's black frame,
+LEDs' bodies; leaves downwards; leaves through the sides, or never went in."""
+
 # Deposits are summed as integers: the sum does not depend on the order of threads
 _FIXED_POINT = float(2**20)
-_MAX_BOUNCES = 256
+_MAX_BOUNCES = 512
 # Legs of the two families of paths that `direct` gathers, and any other
-_IN_AIR, _IN_GUIDE, _DOWN, _IN_GLASS_UP, _BACK_UP, _OTHER = range(6)
+IN_AIR, IN_GUIDE, _DOWN, _IN_GLASS_UP, _BACK_UP, OTHER = range(6)
 _SURE_BOUNCES = 12  # before Russian roulette
 # Fractional parts of powers of 1/phi_4, phi_4 the root of x^5 = x + 1, times 2^32: an additive recurrence
 # that fills the unit 4-cube evenly (Roberts 2018; key roberts2018)
 _RECURRENCE = tuple(int((1.1673039782614187 ** -(k + 1) % 1.0) * 2**32) | 1 for k in range(4))
 
 
-def trace(
+@dataclass(frozen=True)
+class Landed:
+    """What a walk left.
+
+    Attributes
+    ----------
+    maps : (n_led, count, CELLS, CELLS)
+        Sum of throughput times columns[k](cos) on cells [iy, ix] of the deformed surface over the guide's
+        face, without what `direct` gathers.
+    sinks : (n_led, len(SINKS))
+        Sum of throughput that ended there, gathered light included.
+    trapped : (n_led,)
+        Sum of throughput that came to the contact surface for the first time beyond the critical angle to
+        the gaps.
+    """
+
+    maps: Array
+    sinks: Array
+    trapped: Array
+
+
+def walk(
     scene: mi.Scene,
     sensor: Sensor,
     table: Table,
-    basis: AngularBasis,
-    straight: Array,
-    samples: int,
-    seed: int,
-) -> Array:
-    """Weighted irradiance on the contact surface from every LED, but for what `direct` gathers.
-
-    Light comes in two lots. What the gathered light leaves as a mirror reflection is traced from the LEDs;
-    what it makes the tissue re-emit is traced from the surface, whose brightness `straight` tells without
-    noise.
-
-    Parameters
-    ----------
-    scene
-        From `build.load_scene`, with its surface put in place.
-    table
-        Optics of the contact, on the device.
-    basis
-        Weights of the angle of incidence, from `angular_basis`.
-    straight
-        From `direct.direct`, (n_led, count, m, m), W/mm².
-    samples
-        Light paths per LED, half of them in each lot.
-    seed
-        Seed of every random choice; the result depends on nothing else, not even on the number of threads.
-
-    Returns
-    -------
-    (n_led, count, CELLS, CELLS)
-        ∫ columns[k](cos) L cos dω, W/mm², raw (not smoothed) on cells [iy, ix] of the deformed surface over
-        the guide's face.
-    """
-    each = max(samples // 2, 1)
-    index = dr.arange(mi.UInt32, len(sensor.leds) * each)
-    number = index // mi.UInt32(dr.opaque(mi.UInt32, each))
-    place = index - number * dr.opaque(mi.UInt32, each)
-    starts = np.random.Generator(np.random.Philox(seed)).integers(0, 2**32, size=8, dtype=np.uint64)
-
-    in_air = mi.Bool(np.array([led.coupling == "air" for led in sensor.leds]))
-    leg = dr.select(dr.gather(mi.Bool, in_air, number), mi.UInt32(_IN_AIR), mi.UInt32(_IN_GUIDE))
-    lamp = _emit(sensor, number, _evenly(place, starts[:4]))
-    landed = _walk(scene, sensor, basis, number, lamp, mi.Float(1.0), leg, 2 * seed)
-    glow, brightness = _re_emit(scene, sensor, table, basis, straight, number, _evenly(place, starts[4:]))
-    landed += _walk(scene, sensor, basis, number, glow, brightness, mi.UInt32(_OTHER), 2 * seed + 1)
-
-    flux = np.array([led.flux_W for led in sensor.leds])
-    area = (sensor.guide.width_mm / CELLS) ** 2
-    return np.asarray(landed * (flux / each / area)[:, None, None, None])
-
-
-def _walk(
-    scene: mi.Scene,
-    sensor: Sensor,
     basis: AngularBasis,
     number: mi.UInt32,
     ray: mi.Ray3f,
     throughput: mi.Float,
     leg: mi.UInt32,
     seed: int,
-) -> Array:
-    """Follow light through the scene and sum what lands, (n_led, count, CELLS, CELLS)."""
+) -> Landed:
+    """Follow light through the scene until it has ended.
+
+    Parameters
+    ----------
+    scene
+        From `build.load_scene`, with its surface put in place.
+    number
+        LED that each ray's light comes from, rising, as many rays for each.
+    ray, throughput, leg
+        Where it begins, with what weight, and on which leg of the gathered families.
+    seed
+        The result depends on nothing else, not even on the number of threads.
+    """
     n_led, count, width = len(sensor.leds), basis.count, sensor.guide.width_mm
     n_cos = basis.columns.shape[1]
     weights = mi.Float(np.ascontiguousarray(basis.columns.T, dtype=np.float32).ravel())
-    landed = dr.zeros(mi.Int64, n_led * count * CELLS * CELLS)
+    maps = dr.zeros(mi.Int64, n_led * count * CELLS * CELLS)
     named = {shape.id(): mi.ShapePtr(shape) for shape in scene.shapes()}
-    contact = named["contact"]
-    context = mi.BSDFContext(mi.TransportMode.Importance)
+    contact = next(shape for shape in scene.shapes() if shape.id() == "contact")
+    on = mi.ShapePtr(contact)
     lanes = dr.width(number)
     sequence = dr.arange(mi.UInt64, lanes) + 1
     random = mi.PCG32(size=lanes, initstate=dr.opaque(mi.UInt64, seed), initseq=sequence)
-    bounce, alive = mi.UInt32(0), throughput > 0.0
+    critical = float(np.sqrt(max(1.0 - (sensor.skin.gap_index / sensor.guide.refractive_index) ** 2, 0.0)))
+    ended = [mi.Float(0.0) for _ in SINKS]
+    state = (ray, throughput, mi.UInt32(0), leg, throughput > 0.0, random, mi.Float(-1.0), *ended)
 
-    def going(ray, throughput, bounce, leg, alive, random):  # type: ignore[no-untyped-def]
+    def going(ray, throughput, bounce, leg, alive, random, trapped, *ended):  # type: ignore[no-untyped-def]
         return alive
 
-    def step(ray, throughput, bounce, leg, alive, random):  # type: ignore[no-untyped-def]
+    def step(ray, throughput, bounce, leg, alive, random, trapped, *ended):  # type: ignore[no-untyped-def]
+        sink = dict(zip(SINKS, ended, strict=True))
         si = scene.ray_intersect(ray, alive)
+        for medium, lost in absorb(sensor, ray, si, throughput, alive).items():
+            sink[medium] += lost
+            throughput = throughput - lost
+        gone = alive & ~si.is_valid()
+        down = ray.o.z < -sensor.guide.thickness_mm
+        sink["below"] += dr.select(gone & down, throughput, 0.0)
+        sink["aside"] += dr.select(gone & ~down, throughput, 0.0)
         alive &= si.is_valid()
+
         cosine = mi.Frame3f.cos_theta(si.wi)
-        on_contact = alive & (si.shape == contact) & (cosine > 0.0)
-        gathered = on_contact & ((leg == _IN_GUIDE) | (leg == _BACK_UP))  # `direct` has counted these
+        on_contact = alive & (si.shape == on) & (cosine > 0.0)
+        gathered = on_contact & ((leg == IN_GUIDE) | (leg == _BACK_UP))  # `direct` has counted these
         # folded against a wall, the rim stands upright: the map, seen from below, has no area there
         lands = on_contact & ~gathered & (si.n.z < -0.5)
         column = mi.UInt32(dr.clip((si.p.x / width + 0.5) * CELLS, 0.0, CELLS - 1.0))
@@ -125,28 +123,48 @@ def _walk(
         for k, weight in enumerate(weigh(weights, count, n_cos, cosine, lands)):
             amount = mi.Int64(dr.round(throughput * weight * _FIXED_POINT))
             cell = ((number * count + k) * CELLS + row) * CELLS + column
-            dr.scatter_add(landed, amount, cell, lands)
+            dr.scatter_add(maps, amount, cell, lands)
+        trapped = dr.select(
+            on_contact & (trapped < 0.0), dr.select(cosine < critical, throughput, 0.0), trapped
+        )
 
-        # of gathered light only the mirror reflection goes on here: `_re_emit` starts the rest
-        sample1 = dr.select(gathered, 0.0, random.next_float32())
-        sample2 = mi.Point2f(random.next_float32(), random.next_float32())
-        scattered, weight = si.bsdf(ray).sample(context, si, sample1, sample2, alive)
-        mirrored = mi.has_flag(scattered.sampled_type, mi.BSDFFlags.DeltaReflection)
-        share = dr.select(gathered, dr.select(mirrored, scattered.pdf, 0.0), 1.0)
-        throughput = throughput * dr.select(alive, weight[0] * share, 0.0)
-        passed = cosine * mi.Frame3f.cos_theta(scattered.wo) < 0.0
-        leg = _next_leg(leg, si.shape, passed, named)
-        survive = dr.select(bounce < _SURE_BOUNCES, 1.0, dr.minimum(throughput, 0.95))
-        alive &= (throughput > 0.0) & (random.next_float32() < survive) & (bounce < _MAX_BOUNCES)
-        throughput = dr.select(alive, throughput / survive, 0.0)
-        ray = si.spawn_ray(si.to_world(scattered.wo))
-        return ray, throughput, bounce + 1, leg, alive, random
+        fraction = contact.eval_attribute_1("vertex_contact_fraction", si, on_contact)
+        fraction = dr.select(dr.isfinite(fraction), fraction, 0.0)  # slivers at a pressed-back rim
+        entering = dr.select(on_contact, throughput * table.transmittance(fraction, cosine, on_contact), 0.0)
+        sink["tissue"] += entering
+        elsewhere = alive & ~on_contact
+        sample1, sample2 = random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32())
+        direction, share, on_wall = bounce_off(sensor, named, ray, si, elsewhere, sample1, sample2)
+        direction = dr.select(on_contact, mi.reflect(si.wi), direction)
+        kept = dr.select(on_contact, throughput - entering, throughput * share)
+        stopped = dr.select(elsewhere, throughput - kept, 0.0)
+        on_led = _one_of(si.shape, named, "led_")
+        sink["leds"] += dr.select(on_led, stopped, 0.0)
+        sink["walls"] += dr.select(on_wall, stopped, 0.0)
+        sink["frame"] += dr.select(on_led | on_wall, 0.0, stopped)
+        passed = elsewhere & (cosine * mi.Frame3f.cos_theta(direction) < 0.0)
+        leg = _next_leg(leg, si.shape, on_wall, passed, named)
 
-    dr.while_loop((ray, throughput, bounce, leg, alive, random), going, step)
-    return landed.numpy().reshape(n_led, count, CELLS, CELLS).astype(np.float64) / _FIXED_POINT
+        survive = dr.select(bounce < _SURE_BOUNCES, 1.0, dr.minimum(kept, 0.95))
+        alive &= (kept > 0.0) & (random.next_float32() < survive) & (bounce < _MAX_BOUNCES)
+        throughput = dr.select(alive, kept / survive, 0.0)
+        ray = si.spawn_ray(si.to_world(direction))
+        return ray, throughput, bounce + 1, leg, alive, random, trapped, *sink.values()
+
+    end = dr.while_loop(state, going, step)
+
+    def per_led(values: mi.Float) -> Array:
+        return np.asarray(values, dtype=np.float64).reshape(n_led, -1).sum(axis=1)
+
+    dr.eval(maps, end[6:])
+    return Landed(
+        maps.numpy().reshape(n_led, count, CELLS, CELLS).astype(np.float64) / _FIXED_POINT,
+        np.stack([per_led(amount + dr.zeros(mi.Float, lanes)) for amount in end[7:]], axis=1),
+        per_led(dr.maximum(end[6], 0.0)),
+    )
 
 
-def _emit(sensor: Sensor, number: mi.UInt32, u: list[mi.Float]) -> mi.Ray3f:
+def emit(sensor: Sensor, number: mi.UInt32, u: list[mi.Float]) -> mi.Ray3f:
     """Rays from the LEDs' discs, even over area, cosine-weighted over angle."""
     half = sensor.guide.width_mm / 2
     frames = np.array([np.concatenate(led_frame(led, half)) for led in sensor.leds])
@@ -164,18 +182,19 @@ def _emit(sensor: Sensor, number: mi.UInt32, u: list[mi.Float]) -> mi.Ray3f:
     return mi.Ray3f(mi.Point3f(origin + 1e-4 * away), away)
 
 
-def _re_emit(
+def re_emit(
     scene: mi.Scene,
     sensor: Sensor,
     table: Table,
-    basis: AngularBasis,
-    straight: Array,
+    coupling: Coupling,
+    upward: Array,
     number: mi.UInt32,
     u: list[mi.Float],
 ) -> tuple[mi.Ray3f, mi.Float]:
-    """Rays from the contact surface as the tissue re-emits the gathered light, and their share of the flux.
+    """Rays from the contact surface as the tissue re-emits light, and what each carries, times their number.
 
-    Even over the guide's face, directions as in the lobe: one of n rays carries F_landed K T_mean area / n.
+    Even over the guide's face, directions as T(cos) cos, weight as L = (n1/n3)² T(cos) sum phi_i(cos) V_i / pi;
+    `upward` is V (n_led, modes, m, m), W/mm², on cells [iy, ix] of the guide's face.
     """
     width = sensor.guide.width_mm
     x, y = (u[0] - 0.5) * width, (u[1] - 0.5) * width
@@ -184,21 +203,24 @@ def _re_emit(
     contact = next(shape for shape in scene.shapes() if shape.id() == "contact")
     meets = si.is_valid() & (si.shape == mi.ShapePtr(contact))
     fraction = dr.select(meets, contact.eval_attribute_1("vertex_contact_fraction", si, meets), 0.0)
-    landed = land(basis, straight, u[0], u[1], fraction)
-    amount = mi.Float(0.0)
-    for led, lamp in enumerate(sensor.leds):
-        amount = dr.select(number == led, landed[led] * (width**2 / max(lamp.flux_W, 1e-30)), amount)
+    n_led, modes = upward.shape[:2]
+    layers = look_up(upward.reshape(n_led * modes, *upward.shape[2:]), u[0], u[1])
 
     # which of the table's two rows to draw from needs no even spread: any digits of the place will do
     digits = u[0] * 4096.0
     direction = table.draw(fraction, digits - dr.floor(digits), mi.Point2f(u[2], u[3]), meets)
     cosine = mi.Frame3f.cos_theta(direction)
-    lobe = table.transmittance(fraction, cosine, meets) * cosine * dr.inv_pi
-    brightness = amount * table.diffuse_gain(fraction, meets) * lobe / table.density(fraction, cosine, meets)
+    lobes = table.lobes(cosine, meets)
+    brightness = mi.Float(0.0)
+    for led in range(n_led):
+        here = sum(lobe * layers[led * modes + i] for i, lobe in enumerate(lobes))
+        brightness = dr.select(number == led, here, brightness)
+    lobe = coupling.scale * width**2 * table.transmittance(fraction, cosine, meets) * cosine * dr.inv_pi
+    brightness *= lobe / table.density(fraction, cosine, meets)
     return si.spawn_ray(si.to_world(direction)), dr.select(meets, dr.maximum(brightness, 0.0), 0.0)
 
 
-def _evenly(index: mi.UInt32, starts: np.ndarray) -> list[mi.Float]:
+def evenly(index: mi.UInt32, starts: np.ndarray) -> list[mi.Float]:
     """Points of the unit 4-cube that fill it evenly, by an additive recurrence from a random start."""
     return [
         _fraction(dr.opaque(mi.UInt32, int(start)) + index * step)
@@ -206,19 +228,82 @@ def _evenly(index: mi.UInt32, starts: np.ndarray) -> list[mi.Float]:
     ]
 
 
+def absorb(
+    sensor: Sensor, ray: mi.Ray3f, si: mi.SurfaceInteraction3f, throughput: mi.Float, alive: mi.Bool
+) -> dict[str, mi.Float]:
+    """What guide and glass take on the way to the next face; its middle tells through which it leads."""
+    guide, glass = sensor.guide, sensor.glass
+    if guide.absorption_per_mm == 0.0 and glass.absorption_per_mm == 0.0:
+        return {}
+    middle = ray.o + 0.5 * si.t * ray.d
+    within = alive & si.is_valid() & (dr.maximum(dr.abs(middle.x), dr.abs(middle.y)) < guide.width_mm / 2)
+    bottom = -guide.thickness_mm
+    media = (
+        ("guide", guide.absorption_per_mm, middle.z > bottom),
+        ("glass", glass.absorption_per_mm, (middle.z < bottom) & (middle.z > bottom - glass.thickness_mm)),
+    )
+    return {
+        name: dr.select(within & here, throughput * (1.0 - dr.exp(-absorption * si.t)), 0.0)
+        for name, absorption, here in media
+    }
+
+
+def bounce_off(
+    sensor: Sensor,
+    named: dict[str, mi.ShapePtr],
+    ray: mi.Ray3f,
+    si: mi.SurfaceInteraction3f,
+    active: mi.Bool,
+    sample1: mi.Float,
+    sample2: mi.Point2f,
+) -> tuple[mi.Vector3f, mi.Float, mi.Bool]:
+    """Direction (local) and share of the light after a face that is not the contact, and whether it is a side
+    wall."""
+    on_wall = active & _one_of(si.shape, named, "wall_")
+    painted = _painted(sensor, si, on_wall)
+    context = mi.BSDFContext(mi.TransportMode.Importance)
+    scattered, weight = si.bsdf(ray).sample(context, si, sample1, sample2, active & ~painted)
+    direction, kept = scattered.wo, dr.select(active, weight[0], 0.0)
+    if sensor.guide.walls != "polished":
+        albedo = sensor.guide.wall_albedo if sensor.guide.walls == "diffuse" else 0.0
+        back = mi.warp.square_to_cosine_hemisphere(sample2)
+        from_inside = mi.Frame3f.cos_theta(si.wi) < 0.0
+        kept = dr.select(painted, dr.select(from_inside, albedo, 0.0), kept)
+        direction = dr.select(painted, mi.Vector3f(back.x, back.y, -back.z), direction)
+    return direction, kept, on_wall
+
+
+def _painted(sensor: Sensor, si: mi.SurfaceInteraction3f, on_wall: mi.Bool) -> mi.Bool:
+    """Where walls are painted: all over, but for the windows before LEDs in air."""
+    if sensor.guide.walls == "polished":
+        return mi.Bool(False)
+    half, painted = sensor.guide.width_mm / 2, on_wall
+    for led in sensor.leds:
+        if led.coupling == "air":
+            centre, axis, _ = led_frame(led, half)
+            middle = mi.Point3f(*(centre + led.gap_mm * axis).tolist())
+            painted = painted & (dr.squared_norm(si.p - middle) > led.window_mm**2)
+    return painted
+
+
+def _one_of(shape: mi.ShapePtr, named: dict[str, mi.ShapePtr], prefix: str) -> mi.Bool:
+    """Whether a shape is one of those whose name begins so."""
+    found = mi.Bool(False)
+    for name, pointer in named.items():
+        if name.startswith(prefix):
+            found |= shape == pointer
+    return found
+
+
 def _next_leg(
-    leg: mi.UInt32, shape: mi.ShapePtr, passed: mi.Bool, named: dict[str, mi.ShapePtr]
+    leg: mi.UInt32, shape: mi.ShapePtr, on_wall: mi.Bool, passed: mi.Bool, named: dict[str, mi.ShapePtr]
 ) -> mi.UInt32:
     """The leg after an event at `shape`, `passed` if light went through it."""
-    on_wall = mi.Bool(False)
-    for name, pointer in named.items():
-        if name.startswith("wall_"):
-            on_wall |= shape == pointer
     upper, lower = shape == named["guide_to_glass"], shape == named["glass_to_air"]
-    following = mi.UInt32(_OTHER)
+    following = mi.UInt32(OTHER)
     for before, event, after in (
-        (_IN_AIR, on_wall & passed, _IN_GUIDE),
-        (_IN_GUIDE, upper & passed, _DOWN),
+        (IN_AIR, on_wall & passed, IN_GUIDE),
+        (IN_GUIDE, upper & passed, _DOWN),
         (_DOWN, lower & ~passed, _IN_GLASS_UP),
         (_IN_GLASS_UP, upper & passed, _BACK_UP),
     ):

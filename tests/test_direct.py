@@ -20,7 +20,7 @@ def alone(coupling: str, **changes: float) -> Sensor:
 
 
 def irradiance(one: Sensor) -> np.ndarray:
-    """(400, 400) W/mm² on the flat, unloaded contact surface, every angle counting alike."""
+    """(200, 200) W/mm² on the flat, unloaded contact surface, every angle counting alike."""
     from scenes.direct import direct
     from scenes.irradiance import AngularBasis
 
@@ -94,7 +94,7 @@ def test_small_embedded_led_is_lamberts_law(variant: str) -> None:
     one = alone("embedded", diameter_mm=0.01)
     values = irradiance(one)
     half, led = one.guide.width_mm / 2, one.leds[0]
-    line = (np.arange(400) + 0.5) / 400 * 2 * half - half
+    line = (np.arange(200) + 0.5) / 200 * 2 * half - half
     x, y = np.meshgrid(line, line)
     away, up = (half - led.gap_mm) - x, -led.z_mm
     r2 = away**2 + y**2 + up**2

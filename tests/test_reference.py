@@ -26,8 +26,9 @@ def mi(variant: str) -> ModuleType:
 def scene(mi: ModuleType) -> Any:
     """The paper's sensor under a bump, all LEDs on."""
     from scenes import build, surface
+    from scenes.bsdf import Table
 
-    loaded = build.load_scene(SMALL, build.optics_of(SMALL))
+    loaded = build.load_scene(SMALL, Table.pack(build.optics_of(SMALL)))
     build.put_surface(loaded, SMALL, surface.resample(bump(), SMALL.guide.width_mm))
     return loaded
 
@@ -185,20 +186,23 @@ def test_path_gives_the_same_bytes_on_one_thread_and_on_two(mi: ModuleType, scen
 def test_traced_light_is_the_same_bytes_on_one_thread_and_on_two(
     mi: ModuleType, scene: Any, threads: Any
 ) -> None:
-    from scenes import build, direct, irradiance, surface, trace
-    from scenes.bsdf import Table
+    from scenes import Renderer, direct, surface, transport
 
-    table = Table(Table.pack(build.optics_of(SMALL)))
-    basis = irradiance.angular_basis(build.optics_of(SMALL))
+    light = Renderer(SMALL, "cpu")
     shape = surface.resample(bump(), SMALL.guide.width_mm)
-    landed = []
+
+    def upward(seed: int) -> np.ndarray:
+        straight = direct.direct(SMALL, light.basis, shape)
+        ground = transport.survey(scene, SMALL)
+        parts = (scene, SMALL, light.table, light.basis, light.behind, ground, straight)
+        return transport.transport(*parts, 2**15, seed).upward
+
+    found = []
     for count in (1, 2, 2):
         threads(count)
-        straight = direct.direct(SMALL, basis, shape)
-        landed.append(trace.trace(scene, SMALL, table, basis, straight, 2**15, 5))
-    assert landed[0].tobytes() == landed[1].tobytes() == landed[2].tobytes()
-    other = trace.trace(scene, SMALL, table, basis, straight, 2**15, 6)
-    assert np.mean(other != landed[0]) > 0.1  # most cells are dark in both
+        found.append(upward(5))
+    assert found[0].tobytes() == found[1].tobytes() == found[2].tobytes()
+    assert np.mean(upward(6) != found[0]) > 0.9
 
 
 @pytest.mark.parametrize("quality", ["standard", "reference"])

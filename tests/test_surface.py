@@ -23,7 +23,7 @@ def shaped(
     line = np.linspace(-HALF_MM, HALF_MM, nodes)
     x, y = np.meshgrid(line, line)
     shift = np.stack([v + 0.0 * x for v in displacement(x, y)], axis=-1)
-    return OpticalSurface(line, shift, pressure(x, y))
+    return OpticalSurface(line, shift, pressure(x, y), 0 * x)
 
 
 # Resampling
@@ -201,9 +201,10 @@ def mi(variant: str) -> ModuleType:
 @pytest.fixture(scope="module")
 def scene(mi: ModuleType) -> Any:
     from scenes import build
+    from scenes.bsdf import Table
 
     sensor = paper_sensor()
-    return build.load_scene(sensor, build.optics_of(sensor))
+    return build.load_scene(sensor, Table.pack(build.optics_of(sensor)))
 
 
 def shoot(mi: ModuleType, scene: Any, count: int = 2000) -> tuple[np.ndarray, np.ndarray, Any]:

@@ -30,8 +30,9 @@ def mi(variant: str) -> ModuleType:
 
 def load(sensor: Sensor) -> Any:
     from scenes import build
+    from scenes.bsdf import Table
 
-    return build.load_scene(sensor, build.optics_of(sensor))
+    return build.load_scene(sensor, Table.pack(build.optics_of(sensor)))
 
 
 def through_the_glass(
@@ -217,16 +218,19 @@ def test_camera_looks_at_the_deformed_surface(mi: ModuleType) -> None:
     from scenes import build, gather
     from scenes.bsdf import Table
     from scenes.surface import NODES, OpticalSurface
+    from scenes.tissue import couple, tissue_optics
 
     sensor = paper_sensor(columns=48, rows=32, field_of_view_mm=20.0)
     optics = build.optics_of(sensor)
-    scene = build.load_scene(sensor, optics)
+    coupling = couple(optics, tissue_optics(1.0, 0.02), sensor.guide.refractive_index, 1.40)
+    packed = Table.pack(optics, coupling)
+    scene = build.load_scene(sensor, packed)
     line = np.linspace(-HALF_MM, HALF_MM, NODES)
     x, _ = np.meshgrid(line, line)
     plane = np.stack([0 * x, 0 * x, -0.2 + 0.01 * x], axis=-1)
-    build.put_surface(scene, sensor, OpticalSurface(line, plane, np.ones_like(x)))
+    build.put_surface(scene, sensor, OpticalSurface(line, plane, np.ones_like(x), 0 * x))
     rays = view.pixel_rays(sensor)
-    sight = gather.look(scene, sensor, Table(Table.pack(optics)), rays)
+    sight = gather.look(scene, sensor, Table(packed), coupling, rays)
     slope = np.array([0.01, 0.0, -1.0])
     t = -(-0.2 + rays.origin_mm @ slope) / (rays.direction @ slope)
     expected = (rays.origin_mm + t[..., None] * rays.direction)[..., :2]

@@ -24,7 +24,20 @@ import fem
 from fem.model import DomeRadius, Length, Modulus, Offset, Poisson, Sides, Tilt
 from scenes import dispersion
 from scenes.quantity import Wavelength
-from scenes.sensor import Camera, Glass, Guide, Led, RefractiveIndex, Sensor, Skin, Tissue
+from scenes.sensor import (
+    Absorption,
+    Anisotropy,
+    Camera,
+    Glass,
+    Guide,
+    Led,
+    RefractiveIndex,
+    Scattering,
+    Sensor,
+    Skin,
+    Tissue,
+    Walls,
+)
 from twin.complaint import DesignError, from_validation, not_finite, shown
 from twin.conflicts import design_conflicts, inclusion_conflicts
 
@@ -59,6 +72,19 @@ class Waveguide:
             "falls with the wavelength, if left out."
         ),
     ] = None
+    absorption_per_mm: Annotated[
+        Absorption, Field(description="Absorption coefficient of all layers, 1/mm (PDMS: about 0.001).")
+    ] = 0.0
+    walls: Annotated[
+        Walls,
+        Field(
+            description="Side faces: polished; or painted, but for windows before LEDs in air: absorbing, "
+            "or diffuse (white)."
+        ),
+    ] = "polished"
+    wall_albedo: Annotated[
+        float, Field(ge=0.0, le=1.0, description="Share of light that diffuse walls send back, 0 to 1.")
+    ] = 0.9
     dome_radius_mm: Annotated[
         DomeRadius,
         Field(description="Radius of a domed contact surface with its apex in the middle, mm; none if flat."),
@@ -100,14 +126,16 @@ class Specimen:
         Field(description="Sides of the slab: free, or symmetric, as if the tissue went on mirrored there."),
     ] = "free"
     refractive_index: Annotated[RefractiveIndex, Field(description="Refractive index of the tissue.")] = 1.40
-    albedo: Annotated[
-        float,
-        Field(
-            ge=0.0,
-            lt=1.0,
-            description="Share of the light that enters the tissue and comes back out, 0 to 1.",
-        ),
-    ] = 0.68
+    scattering_per_mm: Annotated[
+        Scattering, Field(description="Reduced scattering coefficient µs' = (1 - g) µs of the tissue, 1/mm.")
+    ] = 1.0
+    absorption_per_mm: Annotated[
+        Absorption, Field(description="Absorption coefficient µa of the tissue, 1/mm.")
+    ] = 0.02
+    anisotropy: Annotated[
+        Anisotropy,
+        Field(description="Mean cosine g of one scattering; only the volumetric reference uses it."),
+    ] = 0.0
 
 
 @dataclass(frozen=True, config=CONFIG)
@@ -172,7 +200,9 @@ class Design:
     ] = "finite"
     light: Annotated[Light, Field(description="What light the LEDs give.")] = Light()
     glass: Annotated[Glass, Field(description="The rigid plate between waveguide and camera.")] = Glass()
-    surface: Annotated[Skin, Field(description="The rough contact between waveguide and tissue.")] = Skin()
+    surface: Annotated[
+        Skin, Field(description="The contact between waveguide and tissue: roughness, film, dust, sheet.")
+    ] = Skin()
     press: Annotated[PressDepths, Field(description="The press, where nothing else is said.")] = PressDepths()
     signal: Annotated[Signal, Field(description="The thresholds k of the scalars.")] = Signal()
 
@@ -228,7 +258,19 @@ class Design:
         """Return the waveguide as light of a wavelength sees it, by default that of `light`."""
         waveguide, index = self.waveguide, self.waveguide.refractive_index
         index = index or dispersion.pdms(wavelength_nm or self.light.wavelength_nm)
-        return Guide(waveguide.width_mm, waveguide.thickness_mm, index)
+        return Guide(
+            width_mm=waveguide.width_mm,
+            thickness_mm=waveguide.thickness_mm,
+            refractive_index=index,
+            absorption_per_mm=waveguide.absorption_per_mm,
+            walls=waveguide.walls,
+            wall_albedo=waveguide.wall_albedo,
+        )
+
+    def tissue(self) -> Tissue:
+        """Return the specimen as light sees it."""
+        slab = self.specimen
+        return Tissue(slab.refractive_index, slab.scattering_per_mm, slab.absorption_per_mm, slab.anisotropy)
 
     def sensor(self, wavelength_nm: float | None = None) -> Sensor:
         """Return the whole sensor as light of a wavelength sees it, by default that of `light`."""
@@ -239,15 +281,18 @@ class Design:
             leds=self.leds,
             camera=self.camera,
             skin=self.surface,
-            tissue=Tissue(refractive_index=self.specimen.refractive_index, albedo=self.specimen.albedo),
+            tissue=self.tissue(),
             effective_modulus_kPa=self.effective_modulus_kPa,
             wavelength_nm=wavelength,
         )
 
     @property
     def effective_modulus_kPa(self) -> float:
-        """Contact modulus E*, kPa: 1/E* = sum of (1 - nu²)/E over both surfaces (Johnson 1985, eq. 4.24)."""
-        sides = (self.waveguide.layers[0], self.specimen)
+        """Contact modulus E*, kPa: 1/E* = sum of (1 - nu²)/E over both surfaces (Johnson 1985, eq. 4.24).
+
+        A contact sheet is what touches, so that its modulus counts in the tissue's place.
+        """
+        sides = (self.waveguide.layers[0], self.surface.sheet or self.specimen)
         return 1.0 / sum((1.0 - side.poisson**2) / side.modulus_kPa for side in sides)
 
     @property

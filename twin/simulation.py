@@ -163,13 +163,6 @@ def check(
     by_force: bool = False,
 ) -> None:
     """Raise, before any work is done, if the press cannot be simulated: levels are mm, or N ``by_force``."""
-    from scenes.sensor import NotModelled
-
-    if design.waveguide.dome_radius_mm is not None:
-        raise NotModelled(
-            f"waveguide.dome_radius_mm: received {design.waveguide.dome_radius_mm:g}; not modelled: light in "
-            "a domed guide; allowed is a flat one, without this key (twin export presses domed ones)"
-        )
     presses.check(design, inclusion, levels, by_force=by_force)
 
 

@@ -1,0 +1,239 @@
+"""The picture without shortcuts: rays from the LEDs, seen by the camera wherever they land.
+
+No light is gathered, no angle tabulated apart, nothing smoothed: slower than `transport`, and what that is
+measured against. The camera's view of a point of the surface is the closed form of `view`.
+
+Import only after a variant is set (`scenes.backend.use`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+from . import trace, wander
+from .bsdf import Table
+from .sensor import Sensor
+from .view import PixelRays
+
+Array = NDArray[np.float64]
+
+_MAP = 256  # nodes per side of the maps from surface to film
+_FIXED_POINT = float(2**26)
+_MAX_BOUNCES = 512
+_SURE_BOUNCES = 12
+_BELOW_MM = 0.5  # the surface is looked for from here
+
+
+@dataclass(frozen=True)
+class Film:
+    """Where on the film the camera sees points of a horizontal plane.
+
+    Attributes
+    ----------
+    film : (_MAP, _MAP, 2)
+        Column and row (x.5 are pixels' middles) of the node [iy, ix] of a grid over the guide's face.
+    lean : (_MAP, _MAP, 2)
+        Run in x and y per mm of height of the camera's ray through it.
+    area_mm2 : (rows, columns)
+        Part of the plane that each pixel sees.
+    """
+
+    film: Array
+    lean: Array
+    area_mm2: Array
+
+    @staticmethod
+    def at(sensor: Sensor, rays: PixelRays, height_mm: float) -> Film:
+        """The plane at a height above the contact surface, mm."""
+        lean = rays.direction[..., :2] / rays.direction[..., 2:]
+        hits = rays.origin_mm[..., :2] + lean * (height_mm + sensor.guide.thickness_mm)
+        rows, columns = hits.shape[:2]
+        by_column, by_row = (np.gradient(hits, axis=axis) for axis in (1, 0))
+        area = np.abs(by_column[..., 0] * by_row[..., 1] - by_column[..., 1] * by_row[..., 0])
+
+        line = np.linspace(-0.5, 0.5, _MAP) * sensor.guide.width_mm
+        target = np.stack(np.meshgrid(line, line), axis=-1)
+        middle = np.array([rows // 2, columns // 2])
+        scale = np.array([by_column[*middle, 0], by_row[*middle, 1]])
+        film = (target - hits[*middle]) / scale + middle[::-1]
+        for _ in range(8):  # the map bends little: each turn leaves a tenth or less
+            film = film + (target - _look_up(hits, film)) / scale
+        return Film(film + 0.5, _look_up(lean, film), area)
+
+
+def _look_up(values: Array, film: Array) -> Array:
+    """Values (rows, columns, 2) at film coordinates (..., 2) of pixels' middles, straight on beyond."""
+    rows, columns = values.shape[:2]
+    inside = np.clip(film, 0.0, [columns - 1.0, rows - 1.0])
+    index = np.moveaxis(inside[..., ::-1], -1, 0)
+    found = np.stack([map_coordinates(values[..., i], index, order=1) for i in (0, 1)], axis=-1)
+    by_column, by_row = (
+        np.stack([map_coordinates(g[..., i], index, order=1) for i in (0, 1)], axis=-1)
+        for g in (np.gradient(values, axis=1), np.gradient(values, axis=0))
+    )
+    beyond = film - inside
+    return np.asarray(found + beyond[..., :1] * by_column + beyond[..., 1:] * by_row)
+
+
+@dataclass(frozen=True)
+class _View:
+    """A `Film` on the device, with the layers of radiance that collect on it."""
+
+    maps: mi.Texture2f
+    rows: int
+    columns: int
+    width: float
+    layers: mi.Int64
+
+    @staticmethod
+    def of(film: Film, sensor: Sensor) -> _View:
+        rows, columns = film.area_mm2.shape
+        stacked = np.concatenate([film.film, film.lean], axis=-1).astype(np.float32)
+        maps = mi.Texture2f(mi.TensorXf(stacked), wrap_mode=dr.WrapMode.Clamp)
+        layers = dr.zeros(mi.Int64, len(sensor.leds) * rows * columns)
+        return _View(maps, rows, columns, sensor.guide.width_mm, layers)
+
+    def _look_up(self, x: mi.Float, y: mi.Float) -> list[mi.Float]:
+        # nodes sit at the ends of the face, a texture's in the middle of its texels
+        u, v = (((at / self.width + 0.5) * (_MAP - 1) + 0.5) / _MAP for at in (x, y))
+        return list(self.maps.eval(mi.Point2f(u, v)))
+
+    def towards(self, point: mi.Point3f) -> mi.Vector3f:
+        """Direction, down, from a point to the camera, with z = -1."""
+        _, _, lean_x, lean_y = self._look_up(point.x, point.y)
+        return mi.Vector3f(-lean_x, -lean_y, -1.0)
+
+    def add(self, number: mi.UInt32, point: mi.Point3f, amount: mi.Float, active: mi.Bool) -> None:
+        """Count an amount at the pixel that sees a point."""
+        lean = self.towards(point)
+        column, row, _, _ = self._look_up(point.x + point.z * lean.x, point.y + point.z * lean.y)
+        inside = active & (column >= 0.0) & (column < self.columns) & (row >= 0.0) & (row < self.rows)
+        pixel = mi.UInt32(dr.maximum(row, 0.0)) * self.columns + mi.UInt32(dr.maximum(column, 0.0))
+        fixed = mi.Int64(dr.round(amount * _FIXED_POINT))
+        dr.scatter_add(self.layers, fixed, number * (self.rows * self.columns) + pixel, inside)
+
+
+def exact(
+    scene: mi.Scene,
+    sensor: Sensor,
+    table: Table,
+    rays: PixelRays,
+    fraction: Array,
+    samples: int,
+    seed: int,
+    *,
+    local: bool = False,
+) -> Array:
+    """What the camera sees directly, and mirrored once in the lower faces, without the ways between.
+
+    Parameters
+    ----------
+    scene
+        From `build.load_scene`, with its surface put in place.
+    fraction
+        Real contact fraction (m, m) on cells [iy, ix] of the deformed surface over the guide's face.
+    samples
+        Light paths per LED.
+    local
+        Take tissue for the diffuse lobe of the scene's BSDF, which sends light back where it came in: what
+        stock `path` sees.
+
+    Returns
+    -------
+    (2, n_led, rows, columns)
+        Radiance in the guide that leaves the surface towards each pixel, W mm⁻² sr⁻¹: straight, and by the
+        lower faces and the contact surface, whose reflectances are left out.
+    """
+    n_led = len(sensor.leds)
+    films = [Film.at(sensor, rays, height) for height in (0.0, mirrored_run_mm(sensor))]
+    views = [_View.of(film, sensor) for film in films]
+    contact = next(shape for shape in scene.shapes() if shape.id() == "contact")
+    named = {shape.id(): mi.ShapePtr(shape) for shape in scene.shapes()}
+    context = mi.BSDFContext(mi.TransportMode.Importance)
+    spots = mi.Texture2f(mi.TensorXf(fraction[..., None].astype(np.float32)), wrap_mode=dr.WrapMode.Clamp)
+    squeezed = (sensor.guide.refractive_index / sensor.tissue.refractive_index) ** 2
+
+    index = dr.arange(mi.UInt32, n_led * samples)
+    number = index // mi.UInt32(dr.opaque(mi.UInt32, samples))
+    place = index - number * dr.opaque(mi.UInt32, samples)
+    starts = np.random.Generator(np.random.Philox(seed)).integers(0, 2**32, size=4)
+    sequence = dr.arange(mi.UInt64, n_led * samples) + 1
+    random = mi.PCG32(size=n_led * samples, initstate=dr.opaque(mi.UInt64, seed), initseq=sequence)
+
+    def going(ray, throughput, bounce, alive, random):  # type: ignore[no-untyped-def]
+        return alive
+
+    def step(ray, throughput, bounce, alive, random):  # type: ignore[no-untyped-def]
+        si = scene.ray_intersect(ray, alive)
+        for lost in trace.absorb(sensor, ray, si, throughput, alive).values():
+            throughput = throughput - lost
+        alive &= si.is_valid()
+        cosine = mi.Frame3f.cos_theta(si.wi)
+        touches = alive & (si.shape == mi.ShapePtr(contact)) & (cosine > 0.0)
+        a = contact.eval_attribute_1("vertex_contact_fraction", si, touches)
+        a = dr.select(dr.isfinite(a), a, 0.0)  # slivers at a pressed-back rim
+        u1, u2 = random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32())
+        direction, share, _ = trace.bounce_off(sensor, named, ray, si, alive & ~touches, u1, u2)
+        through = table.transmittance(a, cosine, touches)
+        if local:
+            # what leaves towards the camera is known before it is drawn
+            glow = throughput * through * dr.inv_pi
+            for view in views:
+                down = view.towards(si.p)
+                off = dr.dot(si.sh_frame.n, down)
+                off_unit = off * dr.rcp(dr.norm(down))
+                seen = table.transmittance(a, off_unit, touches) * table.diffuse(a, cosine, off_unit, touches)
+                view.add(number, si.p, glow * seen * dr.dot(si.n, down), touches & (off > 0.0))
+            scattered, weight = si.bsdf(ray).sample(context, si, u1, u2, touches)
+            direction = dr.select(touches, scattered.wo, direction)
+            share = dr.select(touches, weight[0], share)
+            following = si.spawn_ray(si.to_world(direction))
+        else:
+            direction = dr.select(touches, mi.reflect(si.wi), direction)
+            share = dr.select(touches, 1.0, share)
+            following = si.spawn_ray(si.to_world(direction))
+            enters = touches & (u1 < through)
+            back, left, random = wander.wander(
+                sensor, table, spots, views, si, number, throughput, enters, random
+            )
+            share = dr.select(enters, left, share)
+            following = dr.select(enters, _come_back(scene, contact, back), following)
+        kept = throughput * share
+        survive = dr.select(bounce < _SURE_BOUNCES, 1.0, dr.minimum(kept, 0.95))
+        alive &= (kept > 0.0) & (random.next_float32() < survive) & (bounce < _MAX_BOUNCES)
+        return following, dr.select(alive, kept / survive, 0.0), bounce + 1, alive, random
+
+    begin = (trace.emit(sensor, number, trace.evenly(place, starts)), dr.full(mi.Float, 1.0, n_led * samples))
+    dr.while_loop((*begin, mi.UInt32(0), mi.Bool(True), random), going, step)
+    scale = np.array([led.flux_W for led in sensor.leds])[:, None, None] / samples / _FIXED_POINT * squeezed
+    if local:
+        scale = scale / squeezed
+    return np.stack(
+        [
+            scale * view.layers.numpy().reshape(n_led, view.rows, view.columns) / film.area_mm2
+            for view, film in zip(views, films, strict=True)
+        ]
+    )
+
+
+def mirrored_run_mm(sensor: Sensor) -> float:
+    """How much deeper in the guide the surface seems when it is seen by the glass's lower face, near the
+    axis."""
+    guide, glass = sensor.guide, sensor.glass
+    ratio = guide.refractive_index / glass.refractive_index
+    return 2.0 * (guide.thickness_mm + glass.thickness_mm * ratio)
+
+
+def _come_back(scene: mi.Scene, contact: mi.Shape, ray: mi.Ray3f) -> mi.Ray3f:
+    """A ray that leaves the tissue, from the surface itself: tissue is flat only over a spot of light."""
+    below = mi.Ray3f(mi.Point3f(ray.o.x, ray.o.y, ray.o.z - _BELOW_MM), mi.Vector3f(0.0, 0.0, 1.0))
+    si = scene.ray_intersect(below)
+    meets = si.is_valid() & (si.shape == mi.ShapePtr(contact))
+    start = si.spawn_ray(ray.d)
+    return mi.Ray3f(dr.select(meets, start.o, mi.Point3f(0.0, 0.0, 1e3)), ray.d)

@@ -1,0 +1,154 @@
+"""From LEDs to the light that leaves the tissue: walks through the guide and passes in the tissue in turn.
+
+Import only after a variant is set (`scenes.backend.use`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from . import trace
+from .bsdf import Table
+from .irradiance import AngularBasis, smooth, transmitted
+from .sensor import Sensor
+from .spread import Spread
+from .tissue import Coupling
+
+Array = NDArray[np.float64]
+
+GRID = 200  # cells of the maps per side
+_ORDERS = 12  # of re-emission at most
+_ENOUGH = 1e-4  # share of the light below which the next order is left out
+
+
+@dataclass(frozen=True)
+class Behind:
+    """What lies behind the contact, and how light spreads in it."""
+
+    coupling: Coupling
+    spread: Spread
+
+
+@dataclass(frozen=True)
+class Ground:
+    """The contact as the tissue's light meets it, on cells [iy, ix] of the guide's face.
+
+    Attributes
+    ----------
+    fraction : (GRID, GRID)
+        Real contact fraction of the deformed surface there; 0 beside the surface.
+    meets : (GRID, GRID)
+        Whether the surface lies there.
+    """
+
+    fraction: Array
+    meets: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Light:
+    """Light in the tissue and its whereabouts.
+
+    Attributes
+    ----------
+    upward : (n_led, modes, GRID, GRID)
+        Light that goes up inside the tissue towards the contact surface, V_i of `tissue`, W/mm².
+    sinks : (n_led, len(trace.SINKS))
+        W that end there; "tissue" is what the tissue keeps.
+    trapped : (n_led,)
+        W that come to the contact surface for the first time beyond the critical angle.
+    """
+
+    upward: Array
+    sinks: Array
+    trapped: Array
+
+
+def survey(scene: mi.Scene, sensor: Sensor) -> Ground:
+    """Look at the deformed surface from below, cell by cell."""
+    width = sensor.guide.width_mm
+    middles = (np.arange(GRID) + 0.5) / GRID * width - width / 2
+    x, y = (mi.Float(values.ravel().astype(np.float32)) for values in np.meshgrid(middles, middles))
+    contact = next(shape for shape in scene.shapes() if shape.id() == "contact")
+    height = -0.5 * sensor.guide.thickness_mm
+    si = scene.ray_intersect(mi.Ray3f(mi.Point3f(x, y, height), mi.Vector3f(0.0, 0.0, 1.0)))
+    meets = si.is_valid() & (si.shape == mi.ShapePtr(contact))
+    fraction = dr.select(meets, contact.eval_attribute_1("vertex_contact_fraction", si, meets), 0.0)
+    found = [np.asarray(values).reshape(GRID, GRID) for values in (fraction, meets)]
+    return Ground(found[0].astype(np.float64), found[1].astype(bool))
+
+
+def transport(
+    scene: mi.Scene,
+    sensor: Sensor,
+    table: Table,
+    basis: AngularBasis,
+    behind: Behind,
+    ground: Ground,
+    straight: Array,
+    samples: int,
+    seed: int,
+) -> Light:
+    """Follow the LEDs' light until it has ended.
+
+    Mirrored light walks through the guide (`trace.walk`); what enters the tissue spreads there, and what
+    comes back out walks again, order by order.
+
+    Parameters
+    ----------
+    straight
+        From `direct.direct`, (n_led, count, GRID, GRID), W/mm².
+    samples
+        Light paths per LED, half of them from the LED itself.
+    seed
+        Seed of every random choice; the result depends on nothing else, not even on the number of threads.
+    """
+    n_led = len(sensor.leds)
+    flux = np.array([led.flux_W for led in sensor.leds])
+    starts = np.random.Generator(np.random.Philox(seed)).integers(0, 2**32, size=(_ORDERS + 1, 4))
+
+    def walk(order: int, each: int, upward: Array | None) -> tuple[Array, Array, Array, Array]:
+        index = dr.arange(mi.UInt32, n_led * each)
+        number = index // mi.UInt32(dr.opaque(mi.UInt32, each))
+        place = index - number * dr.opaque(mi.UInt32, each)
+        u = trace.evenly(place, starts[order])
+        if upward is None:
+            legs = [trace.IN_AIR if led.coupling == "air" else trace.IN_GUIDE for led in sensor.leds]
+            leg = dr.gather(mi.UInt32, mi.UInt32(np.array(legs, dtype=np.uint32)), number)
+            ray, amount, scale = trace.emit(sensor, number, u), dr.full(mi.Float, 1.0, n_led * each), flux
+        else:
+            ray, amount = trace.re_emit(scene, sensor, table, behind.coupling, upward, number, u)
+            scale = upward[:, 0].mean(axis=(1, 2)) * sensor.guide.width_mm**2
+            amount /= dr.gather(mi.Float, mi.Float(np.maximum(scale, 1e-30)), number)
+            leg = mi.UInt32(trace.OTHER)
+        begun = np.asarray(amount, dtype=np.float64).reshape(n_led, each).mean(axis=1)
+        found = trace.walk(scene, sensor, table, basis, number, ray, amount, leg, 16 * seed + order)
+        area = (sensor.guide.width_mm / trace.CELLS) ** 2
+        maps = found.maps * (scale / each / area)[:, None, None, None]
+        sinks, trapped = found.sinks * (scale / each)[:, None], found.trapped * scale / each
+        return maps, sinks, trapped, begun * scale
+
+    each = max(samples // 2, 1)
+    maps, sinks, trapped, _ = walk(0, each, None)
+    landed = straight + smooth(maps, GRID // trace.CELLS)
+    total = newest = _spread(basis, behind, ground, landed)
+    for order in range(1, _ORDERS + 1):
+        if newest[:, 0].sum() <= _ENOUGH * total[:, 0].sum():
+            break
+        maps, more, _, begun = walk(order, max(each >> min(order - 1, 4), 1), newest)
+        sinks = sinks + more
+        sinks[:, 0] -= begun
+        newest = _spread(basis, behind, ground, smooth(maps, GRID // trace.CELLS))
+        total = total + newest
+    return Light(total, sinks, trapped)
+
+
+def _spread(basis: AngularBasis, behind: Behind, ground: Ground, landed: Array) -> Array:
+    """Light that goes up in the tissue, (n_led, modes, GRID, GRID), from weighted irradiance."""
+    entering = transmitted(basis, landed, ground.fraction) * ground.meets
+    return behind.spread.solve(entering, ground.fraction)
