@@ -221,16 +221,19 @@ class Sensor:
     wavelength_nm: Annotated[Wavelength, Field(description="Wavelength of the light, nm.")] = 550.0
 
     def __post_init__(self) -> None:
-        for conflict in conflicts(self.guide, self.leds, self.camera, self.skin):
+        for conflict in conflicts(self.guide, self.leds, self.camera, self.skin, self.glass):
             raise ValueError(f"{conflict.field}: received {conflict.received!r}; allowed {conflict.allowed}")
 
 
-def conflicts(guide: Guide, leds: tuple[Led, ...], camera: Camera, skin: Skin) -> Iterator[Conflict]:
+def conflicts(
+    guide: Guide, leds: tuple[Led, ...], camera: Camera, skin: Skin, glass: Glass | None = None
+) -> Iterator[Conflict]:
     """Yield every value that does not fit the others, in the order of the arguments.
 
     The fields are named ``leds.0.z_mm``, ``camera.field_of_view_mm``, ``skin.gap_index`` and so on.
     """
-    yield from led_conflicts(leds, guide.width_mm, guide.thickness_mm)
+    plate = glass or Glass()
+    yield from led_conflicts(leds, guide.width_mm, guide.thickness_mm, plate.thickness_mm, camera.distance_mm)
     yield from camera_conflicts(camera, guide.width_mm, guide.thickness_mm, len(leds))
     if skin.gap_index >= guide.refractive_index:
         yield Conflict(

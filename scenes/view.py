@@ -119,7 +119,23 @@ def pixel_rays(sensor: Sensor) -> PixelRays:
     offset = offset + in_glass[..., :2] / in_glass[..., 2:] * glass.thickness_mm
     origin = np.concatenate([offset, np.full((*offset.shape[:2], 1), -guide.thickness_mm)], axis=-1)
     transmittance = 1.0 - faces_reflectance(sensor, in_guide[..., 2])
+    transmittance = np.where(_blocked(sensor, in_air, in_glass), 0.0, transmittance)
     return PixelRays(origin, in_guide, transmittance, 1.0 / guide.refractive_index**2)
+
+
+def _blocked(sensor: Sensor, in_air: Array, in_glass: Array) -> NDArray[np.bool_]:
+    """Which rays meet the black back of an LED below, (rows, columns)."""
+    lean_air, lean_glass = (rays[..., :2] / rays[..., 2:] for rays in (in_air, in_glass))
+    blocked = np.zeros(in_air.shape[:2], bool)
+    for led in sensor.leds:
+        if led.side != "below":
+            continue
+        in_front = led.gap_mm if led.coupling == "air" else 0.0
+        meets = lean_air * (sensor.camera.distance_mm - in_front)
+        if led.coupling == "embedded":
+            meets = meets + lean_glass * led.gap_mm
+        blocked |= np.hypot(meets[..., 0] - led.x_mm, meets[..., 1] - led.y_mm) < led.diameter_mm / 2
+    return blocked
 
 
 def faces_reflectance(sensor: Sensor, cosine: Array) -> Array:

@@ -43,7 +43,7 @@ def design_conflicts(design: Design) -> Iterator[DesignError]:
         yield DesignError("specimen.width_mm", shown(slab.width_mm), allowed)
     yield from _dome_conflicts(design)
     redmost = design.guide(longest(design.leds, design.light.wavelength_nm))  # where the index is lowest
-    for conflict in optical_conflicts(redmost, design.leds, design.camera, design.surface):
+    for conflict in optical_conflicts(redmost, design.leds, design.camera, design.surface, design.glass):
         field = conflict.field.replace("skin.", "surface.")
         yield DesignError(field, shown(conflict.received), conflict.allowed)
     if slab.width_mm < design.waveguide.width_mm:
