@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from .camera import expose, mean_counts, tare
 from .ftir import gap_transmittance
-from .sensor import Camera, Glass, Guide, Led, Sensor, Sheet, Skin, Tissue
+from .sensor import Camera, Glass, Guide, Led, Sensor
+from .skin import Sheet, Skin, Tissue
 
 if TYPE_CHECKING:
     from .render import Renderer, Rendering

@@ -119,6 +119,29 @@ class Table:
         return dr.lerp(dr.gather(mi.Float, data, i, active), dr.gather(mi.Float, data, i + 1, active), u)
 
 
+def read_table(filename: str) -> mi.TensorXf:
+    """A packed table from an .npy file; relative names are looked for beside the scene file.
+
+    Raises ValueError, in one line, for a file that is no such table.
+    """
+    path = mi.file_resolver().resolve(filename)
+    try:
+        packed = np.load(str(path), allow_pickle=False)
+    except (OSError, ValueError) as error:
+        raise ValueError(
+            f"frustrated_tir: filename: received {filename!r} ({error}); allowed a table"
+        ) from None
+    modes = packed[-1, -1] if packed.ndim == 2 and packed.size and packed.dtype == np.float32 else np.nan
+    if modes not in range(1, 9) or min(packed.shape[0] - modes, packed.shape[1] - 1 - modes**2) < 2:
+        received = f"{filename!r} with {packed.dtype} of shape {packed.shape}"
+        raise ValueError(f"frustrated_tir: filename: received {received}; allowed a table of `Table.pack`")
+    shares = packed[: -int(modes), : -int(modes**2)]
+    if not (np.isfinite(packed).all() and shares.min() >= 0.0 and shares.max() <= 1.0 + 1e-5):
+        received = f"{filename!r} with numbers that are no shares of light"
+        raise ValueError(f"frustrated_tir: filename: received {received}; allowed 0 to 1")
+    return mi.TensorXf(packed)
+
+
 _BINS = 512  # of squared cosine, in which `Table.draw` takes T as constant
 _FLOOR = 1e-4  # of T there: no direction is left out
 
@@ -139,16 +162,18 @@ def _cell(x: mi.Float, nodes: int) -> tuple[mi.UInt32, mi.Float]:
 
 
 class FrustratedTIR(mi.BSDF):
-    """Mirror reflection 1 - T and a diffuse lobe T(cos_i) T(cos_o) K(cos_i, cos_o) / pi; reciprocal, and black
-    from behind.
+    """Mirror reflection 1 - T and a diffuse lobe T(cos_i) T(cos_o) K(cos_i, cos_o) / pi.
 
-    Properties: `table` (from `Table.pack`), `contact_fraction` (a texture, real contact fraction 0..1). The
-    side that the surface normal points to is the guide.
+    Reciprocal, and black from behind.
+
+    Properties: `table` (from `Table.pack`) or `filename` (of an .npy file that holds it), `contact_fraction`
+    (a texture, real contact fraction 0..1). The side that the surface normal points to is the guide.
     """
 
     def __init__(self, props: mi.Properties) -> None:
         mi.BSDF.__init__(self, props)
-        self.table = Table(mi.TensorXf(props["table"]))
+        packed = props["table"] if "table" in props else read_table(props["filename"])
+        self.table = Table(mi.TensorXf(packed))
         self.fraction = props["contact_fraction"]
         mirror = mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.FrontSide | mi.BSDFFlags.SpatiallyVarying
         diffuse = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide | mi.BSDFFlags.SpatiallyVarying
@@ -244,10 +269,9 @@ class FrustratedTIR(mi.BSDF):
         return dr.maximum(value, 0.0) * cos_o * dr.inv_pi
 
     def _typical(self, a: mi.Float, cos_i: mi.Float, active: mi.Bool) -> mi.Float:
-        """About the share of the light that passed that comes back: it only decides how often to follow it."""
-        return dr.maximum(self.table.diffuse(a, cos_i, cos_i, active), 1e-3) * self.table.hemispherical(
-            a, active
-        )
+        """About what comes back of the light that passed: it only decides how often to follow it."""
+        back = dr.maximum(self.table.diffuse(a, cos_i, cos_i, active), 1e-3)
+        return back * self.table.hemispherical(a, active)
 
     def to_string(self) -> str:
         return f"FrustratedTIR[table = {self.table.rows} x {self.table.columns}]"

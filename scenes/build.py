@@ -18,7 +18,7 @@ from . import (
 )
 from .contact import ContactOptics, contact_optics, real_contact
 from .sensor import Led, Sensor
-from .tissue import body_behind
+from .tissue import Coupling, body_behind, couple
 
 _BLACK = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.0}}}
 _OUTWARD = {"+x": (1.0, 0.0), "-x": (-1.0, 0.0), "+y": (0.0, 1.0), "-y": (0.0, -1.0)}
@@ -40,6 +40,12 @@ def optics_of(sensor: Sensor) -> ContactOptics:
     )
 
 
+def coupling_of(sensor: Sensor, optics: ContactOptics) -> Coupling:
+    """Tissue or sheet of this sensor behind its contact."""
+    index, body = body_behind(sensor.skin, sensor.tissue)
+    return couple(optics, body, sensor.guide.refractive_index, index)
+
+
 def load_scene(sensor: Sensor, table: mi.TensorXf) -> mi.Scene:
     """Load the sensor with a flat, unloaded contact surface whose optics are `table` (`bsdf.Table.pack`).
 
@@ -48,6 +54,12 @@ def load_scene(sensor: Sensor, table: mi.TensorXf) -> mi.Scene:
     held in a black frame and nothing surrounds the sensor (a black housing). Side walls stay flat: their
     bulge under load, 0.1 mm, is left out.
     """
+    scene = describe(sensor, _contact_mesh(sensor, table))
+    return mi.load_dict(scene, optimize=False)  # merging would lose the walls' names
+
+
+def describe(sensor: Sensor, contact: mi.Mesh | dict[str, Any]) -> dict[str, Any]:
+    """The scene as Mitsuba's dictionary, with this contact surface."""
     guide, glass = sensor.guide, sensor.glass
     half, bottom = guide.width_mm / 2, -guide.thickness_mm
     lowest = bottom - glass.thickness_mm
@@ -55,7 +67,7 @@ def load_scene(sensor: Sensor, table: mi.TensorXf) -> mi.Scene:
     scene: dict[str, Any] = {
         "type": "scene",
         "camera": pinhole.describe(sensor),
-        "contact": _contact_mesh(sensor, table),
+        "contact": contact,
         "guide_to_glass": _face(half, bottom, _dielectric(guide.refractive_index, glass.refractive_index)),
         "glass_to_air": _face(half, lowest, _dielectric(glass.refractive_index, 1.0)),
     }
@@ -64,7 +76,7 @@ def load_scene(sensor: Sensor, table: mi.TensorXf) -> mi.Scene:
         scene[f"rim_{side}"] = _wall(half, lowest, bottom, outward, _BLACK)
     for number, led in enumerate(sensor.leds):
         scene[f"led_{number}"] = _led(led, half, lowest)
-    return mi.load_dict(scene, optimize=False)  # merging would lose the walls' names
+    return scene
 
 
 def _side_wall(sensor: Sensor) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.special import erf
 
 from .ftir import gap_transmittance
-from .sensor import Skin
+from .skin import Skin
 
 Array = NDArray[np.float64]
 
@@ -32,7 +32,7 @@ def contact_fraction(pressure_kPa: Array, modulus_kPa: float, rms_slope: float, 
 def real_contact(pressure_kPa: Array, skin: Skin, modulus_kPa: float) -> Array:
     """Real over apparent contact area of what can touch (the dust's share left out), shape of the pressure.
 
-    "rough" is `contact_fraction`; "full" is 1 wherever there is pressure: adhesion or gel has closed the gaps.
+    "rough" is `contact_fraction`; "full" is 1 wherever there is pressure: adhesion or gel closes all gaps.
     """
     if skin.contact == "full":
         return np.where(np.asarray(pressure_kPa) > 0.0, 1.0, 0.0)
@@ -91,16 +91,17 @@ def contact_optics(
     """Tabulate the optics of a rough contact between guide and a diffusing tissue.
 
     Real contact (gap 0) takes the share A_r, gaps distributed exponentially about `mean_gap_um` the rest; T
-    is averaged over them (T of the mean gap would be wrong: T falls within 100 to 300 nm). The share `dust` of
-    the area stays apart by far more than a wavelength, at any pressure: its T is the mean over all fringes, and
-    nothing tunnels. What is transmitted is made isotropic in the tissue, of which the share `albedo` comes back to the surface per
-    pass; the surface sends part of it back down. With T_in the hemispherical transmittance from the tissue
-    side, (n1/n3)² times the guide side's by reciprocity, the passes sum to
+    is averaged over them (T of the mean gap would be wrong: T falls within 100 to 300 nm). The share `dust`
+    of the area stays apart by far more than a wavelength, at any pressure: its T is the mean over all
+    fringes, and nothing tunnels. What is transmitted is made isotropic in the tissue, of which the share
+    `albedo` comes back to the surface per pass; the surface sends part of it back down. With T_in the
+    hemispherical transmittance from the tissue side, (n1/n3)² times the guide side's by reciprocity, the
+    passes sum to
 
         K = (n1/n3)² albedo / (1 - albedo (1 - T_in)).
 
-    That is the local limit, with Lambertian light in the tissue; `tissue` has depth and angles. Scattering of the
-    mirror reflection by the roughness is left out.
+    That is the local limit, with Lambertian light in the tissue; `tissue` has depth and angles. Scattering
+    of the mirror reflection by the roughness is left out.
     """
     fraction = np.linspace(0.0, 1.0, n_fraction)
     cosine = np.linspace(0.0, 1.0, n_cos)

@@ -26,7 +26,9 @@ Array = NDArray[np.float64]
 
 CELLS = 200  # of the grid of target points, per side
 DISC_POINTS = 96
-_NEWTON_STEPS = 7
+_NEWTON_STEPS = 7  # from a guess
+_NEWTON_AGAIN = 2  # from the disc's point before
+_STRIPES = 9
 _GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 
 
@@ -74,9 +76,7 @@ def direct(sensor: Sensor, basis: AngularBasis, deformed: OpticalSurface) -> Arr
     x, y = np.meshgrid(middles, middles)
     target = [_float(values) for values in (x, y, height, slope_x, slope_y)]
 
-    radius = np.sqrt((np.arange(DISC_POINTS) + 0.5) / DISC_POINTS)  # a sunflower: equal areas
-    angle = _GOLDEN_ANGLE * np.arange(DISC_POINTS)
-    disc = _float(np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1))
+    disc = _float(_disc_points())
 
     index = dr.arange(mi.UInt32, n_led * CELLS * CELLS)
     led, point = index // (CELLS * CELLS), index % (CELLS * CELLS)
@@ -84,24 +84,35 @@ def direct(sensor: Sensor, basis: AngularBasis, deformed: OpticalSurface) -> Arr
     source = _Source.of(sensor, led)
     weights = _float(basis.columns.T)
 
-    total = [mi.Float(0.0) for _ in range(count)]
-    number = mi.UInt32(0)
-
-    def more(number, *total):  # type: ignore[no-untyped-def]
+    def more(number, straight, mirrored, *total):  # type: ignore[no-untyped-def]
         return number < DISC_POINTS
 
-    def add(number, *total):  # type: ignore[no-untyped-def]
+    def add(number, straight, mirrored, *total):  # type: ignore[no-untyped-def]
         on_disc = dr.gather(mi.Point2f, disc, number)
-        for mirrored in (False, True):
-            flux, cosine = _arrives(sensor, source, on_disc, here, mirrored)
+        slopes = []
+        for by_glass, begin in ((False, straight), (True, mirrored)):
+            flux, cosine, slope = _arrives(sensor, source, on_disc, here, by_glass, begin)
             weight = weigh(weights, count, basis.columns.shape[1], cosine, flux > 0.0)
             total = tuple(sum_ + flux * w for sum_, w in zip(total, weight, strict=True))
-        return number + 1, *total
+            slopes.append(slope)
+        return number + 1, *slopes, *total
 
-    total = list(dr.while_loop((number, *total), more, add))[1:]
+    begin = [_first_guess(sensor, source, here, by_glass) for by_glass in (False, True)]
+    state = (mi.UInt32(0), *begin, *(mi.Float(0.0) for _ in range(count)))
+    total = list(dr.while_loop(state, more, add))[3:]
     dr.eval(total)
     coarse = np.stack([np.asarray(layer).reshape(n_led, CELLS, CELLS) for layer in total], axis=1)
     return coarse.astype(np.float64) / DISC_POINTS
+
+
+def _disc_points() -> Array:
+    """Points (DISC_POINTS, 2) of the unit disc, a sunflower of equal areas, each near the one before."""
+    radius = np.sqrt((np.arange(DISC_POINTS) + 0.5) / DISC_POINTS)
+    angle = _GOLDEN_ANGLE * np.arange(DISC_POINTS)
+    points = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    stripe = np.floor((points[:, 0] + 1.0) * 0.5 * _STRIPES)
+    back_and_forth = np.where(stripe % 2 == 0, points[:, 1], -points[:, 1])
+    return np.asarray(points[np.lexsort((back_and_forth, stripe))])
 
 
 @dataclass(frozen=True)
@@ -149,55 +160,77 @@ class _Source:
         return _Source(led, Patterns(sensor.leds), *columns)
 
 
-def _arrives(
-    sensor: Sensor, source: _Source, on_disc: mi.Point2f, here: list[mi.Float], mirrored: bool
-) -> tuple[mi.Float, mi.Float]:
-    """Irradiance, W/mm², at the targets from one point of each disc, and the cosine of incidence there."""
-    x, y, height, slope_x, slope_y = here
-    guide, glass = sensor.guide, sensor.glass
-    half, n, n_glass = guide.width_mm / 2, guide.refractive_index, glass.refractive_index
-    side_y, disc_z = source.along + source.radius * on_disc.x, source.z + source.radius * on_disc.y
-    # the tangent of `led_frame` is (|axis_y|, |axis_x|)
-    along_axis = x * source.axis_x + y * source.axis_y + half - source.inset
-    along_side = x * dr.abs(source.axis_y) + y * dr.abs(source.axis_x) - side_y
-    up = height - disc_z
-    if mirrored:
-        up = (disc_z + guide.thickness_mm) + (height + guide.thickness_mm)
-    lit = along_axis > 1e-3
-
-    def follow(slope_y: mi.Float, slope_z: mi.Float) -> _Path:
-        through_glass = 2.0 * glass.thickness_mm if mirrored else 0.0
-        return _follow(source, n, n_glass, through_glass, up, along_axis, along_side, slope_y, slope_z)
-
-    # start from the ray inside the guide that a vanishing air gap would give
-    reach = dr.maximum(along_axis, 1e-3)
-    sine_y, sine_z = along_side / reach, up / reach
-    scale = n * dr.rsqrt(1.0 + dr.square(sine_y) + dr.square(sine_z))
+def _first_guess(sensor: Sensor, source: _Source, here: list[mi.Float], by_glass: bool) -> mi.Vector2f:
+    """Slopes of the ray from the middle of the disc that a vanishing air gap would give."""
+    reach, aside, up = _way(sensor, source, mi.Point2f(0.0, 0.0), here, by_glass)
+    reach = dr.maximum(reach, 1e-3)
+    sine_y, sine_z = aside / reach, up / reach
+    scale = sensor.guide.refractive_index * dr.rsqrt(1.0 + dr.square(sine_y) + dr.square(sine_z))
     tangential = dr.sqrt(dr.square(sine_y) + dr.square(sine_z)) * scale
     allowed = dr.minimum(1.0, 0.98 * source.index / dr.maximum(tangential, 1e-6))
     p_y, p_z = sine_y * scale * allowed, sine_z * scale * allowed
     p_x = dr.sqrt(dr.maximum(dr.square(source.index) - dr.square(p_y) - dr.square(p_z), 1e-6))
-    t_y, t_z = p_y / p_x, p_z / p_x
+    slope = mi.Vector2f(p_y / p_x, p_z / p_x)
     for _ in range(_NEWTON_STEPS):
-        path = follow(t_y, t_z)
-        x_y, x_z, y_y, y_z = path.derivative
-        determinant = x_y * y_z - x_z * y_y
-        t_y = t_y - (y_z * path.error.x - x_z * path.error.y) / determinant
-        stepped = t_z - (x_y * path.error.y - y_y * path.error.x) / determinant
-        t_z = dr.maximum(stepped, 0.25 * t_z)  # upwards it stays
-    path = follow(t_y, t_z)
+        slope = _stepped(_follow(sensor, source, (reach, aside, up), by_glass, slope), slope)
+    return slope
+
+
+def _way(
+    sensor: Sensor, source: _Source, on_disc: mi.Point2f, here: list[mi.Float], by_glass: bool
+) -> tuple[mi.Float, mi.Float, mi.Float]:
+    """From a point of the disc to the target: along the axis inside the guide, along the side, and up."""
+    x, y, height, _, _ = here
+    guide = sensor.guide
+    side_y, disc_z = source.along + source.radius * on_disc.x, source.z + source.radius * on_disc.y
+    # the tangent of `led_frame` is (|axis_y|, |axis_x|)
+    along_axis = x * source.axis_x + y * source.axis_y + guide.width_mm / 2 - source.inset
+    along_side = x * dr.abs(source.axis_y) + y * dr.abs(source.axis_x) - side_y
+    up = (disc_z + guide.thickness_mm) + (height + guide.thickness_mm) if by_glass else height - disc_z
+    return along_axis, along_side, up
+
+
+def _stepped(path: _Path, slope: mi.Vector2f) -> mi.Vector2f:
+    """One step of Newton's method; upwards stays upwards."""
+    x_y, x_z, y_y, y_z = path.derivative
+    determinant = x_y * y_z - x_z * y_y
+    t_y = slope.x - (y_z * path.error.x - x_z * path.error.y) / determinant
+    t_z = slope.y - (x_y * path.error.y - y_y * path.error.x) / determinant
+    return mi.Vector2f(t_y, dr.maximum(t_z, 0.25 * slope.y))
+
+
+def _arrives(
+    sensor: Sensor,
+    source: _Source,
+    on_disc: mi.Point2f,
+    here: list[mi.Float],
+    by_glass: bool,
+    begin: mi.Vector2f,
+) -> tuple[mi.Float, mi.Float, mi.Vector2f]:
+    """Irradiance, W/mm², at the targets from one point of each disc, the cosine of incidence there, and the
+    ray's slopes at the disc, found from those of a point nearby."""
+    slope_x, slope_y = here[3:]
+    guide, glass = sensor.guide, sensor.glass
+    half, n, n_glass = guide.width_mm / 2, guide.refractive_index, glass.refractive_index
+    way = _way(sensor, source, on_disc, here, by_glass)
+    side_y, disc_z = source.along + source.radius * on_disc.x, source.z + source.radius * on_disc.y
+    lit = way[0] > 1e-3
+    slope = begin
+    for _ in range(_NEWTON_AGAIN):
+        slope = _stepped(_follow(sensor, source, way, by_glass, slope), slope)
+    path = _follow(sensor, source, way, by_glass, slope)
 
     lit &= dr.abs(path.error.x) + dr.abs(path.error.y) < 1e-2
-    entry_z = disc_z - path.entry_z if mirrored else disc_z + path.entry_z
+    entry_z = disc_z - path.entry_z if by_glass else disc_z + path.entry_z
     lit &= (entry_z > -guide.thickness_mm) & (dr.abs(side_y + path.entry_y) < half)
     if guide.walls != "polished":
         to_window = mi.Vector2f(source.radius * on_disc.x + path.entry_y, source.radius * on_disc.y)
-        to_window.y += -path.entry_z if mirrored else path.entry_z
+        to_window.y += -path.entry_z if by_glass else path.entry_z
         lit &= (source.gap == 0.0) | (dr.squared_norm(to_window) <= dr.square(source.window))
     tangential2 = dr.square(path.p_y) + dr.square(path.p_z)
     in_air = source.gap > 0.0
     share = dr.select(in_air, 1.0 - _fresnel(mi.Float(1.0), mi.Float(n), tangential2), 1.0)
-    if mirrored:
+    if by_glass:
         level2 = dr.square(path.p_x) + dr.square(path.p_y)
         through = 1.0 - _fresnel(mi.Float(n), mi.Float(n_glass), level2)
         share *= dr.square(through) * _fresnel(mi.Float(n_glass), mi.Float(1.0), level2)
@@ -211,24 +244,25 @@ def _arrives(
     flux = source.density * path.etendue * share * facing / path.p_z
     if not source.patterns.lambertian:
         leaving = dr.sqrt(dr.maximum(1.0 - tangential2 / dr.square(source.index), 0.0))
-        rises = -path.p_z if mirrored else path.p_z
+        rises = -path.p_z if by_glass else path.p_z
         flux *= source.patterns.relative(source.number, leaving, path.p_y, rises)
     lit &= facing > 0.0
-    return dr.select(lit, flux, 0.0), dr.select(lit, cosine, 1.0)
+    found = dr.select(lit & dr.isfinite(slope.x + slope.y), slope, begin)
+    return dr.select(lit, flux, 0.0), dr.select(lit, cosine, 1.0), found
 
 
 def _follow(
+    sensor: Sensor,
     source: _Source,
-    n: float,
-    n_glass: float,
-    through_glass: float,
-    up: mi.Float,
-    along_axis: mi.Float,
-    along_side: mi.Float,
-    t_y: mi.Float,
-    t_z: mi.Float,
+    way: tuple[mi.Float, mi.Float, mi.Float],
+    by_glass: bool,
+    slope: mi.Vector2f,
 ) -> _Path:
     """A ray from its slopes at the disc to the target's height, with derivatives to the slopes."""
+    n, n_glass = sensor.guide.refractive_index, sensor.glass.refractive_index
+    through_glass = 2.0 * sensor.glass.thickness_mm if by_glass else 0.0
+    along_axis, along_side, up = way
+    t_y, t_z = slope.x, slope.y
     one = 1.0 + dr.square(t_y) + dr.square(t_z)
     c = source.index * dr.rsqrt(one)
     p_y, p_z = t_y * c, t_z * c

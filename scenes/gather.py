@@ -192,5 +192,5 @@ def picture(sight: Sight, upward: NDArray[np.float64]) -> NDArray[np.float32]:
             total[led] += sum(gain * layers[led * modes + i] for i, gain in enumerate(gains))
     dr.eval(total)
     shape = (n_led, *sight.position_mm.shape[:2])
-    layers = np.stack([np.asarray(layer) for layer in total]).reshape(shape)
-    return np.asarray((layers + sight.lamps) * np.float32(1e6))
+    seen = np.stack([np.asarray(layer) for layer in total]).reshape(shape)
+    return np.asarray((seen + sight.lamps) * np.float32(1e6))

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,6 +59,15 @@ class Lamp:
         share = (turn - self.horizontal_deg[low]) / (self.horizontal_deg[low + 1] - self.horizontal_deg[low])
         where = np.arange(across.shape[1])
         return np.asarray((1.0 - share) * across[low, where] + share * across[low + 1, where])
+
+
+def beside(design: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Return the nested tables of a design, with its LEDs' files as paths from the folder that it lies in."""
+    leds = design.get("leds")
+    for led in leds if isinstance(leds, list) else []:
+        if isinstance(led, dict) and isinstance(led.get("ies"), str) and led["ies"]:
+            led["ies"] = str(folder / led["ies"])
+    return design
 
 
 def read(path: str) -> Lamp:

@@ -24,7 +24,7 @@ _RIM_CELLS = 2  # 0.5 mm
 
 @dataclass(frozen=True)
 class AngularBasis:
-    """Separable form of what enters the tissue, phi_i(cos) T(A_r, cos) = sum_k rows[i, :, k](A_r) columns[k](cos).
+    """Separable form of what enters the tissue: phi_i(cos) T(A_r, cos) = sum_k rows[i, :, k] columns[k](cos).
 
     Light arrives spread over angles, so T and the tissue's lobes phi_i cannot be taken out of the integral
     over them; with this form the integral is `count` irradiances, smooth over the surface, whatever the

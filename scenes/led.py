@@ -135,6 +135,23 @@ class Led:
         return None if None in needs else efficacy(self.spectrum, self.peak_nm, self.fwhm_nm)
 
 
+@dataclass(frozen=True, config=CONFIG)
+class Light:
+    """What a sensor's LEDs have in common, and how their colours are summed."""
+
+    wavelength_nm: Annotated[
+        Wavelength,
+        Field(
+            description="Wavelength of LEDs that are a line, nm. Light of other wavelengths is told as "
+            "radiance of this one that the camera would answer alike."
+        ),
+    ] = 550.0
+    bands: Annotated[
+        int,
+        Field(ge=1, le=64, description="Wavelengths that a spectrum is rendered at; a line takes one."),
+    ] = 3
+
+
 def led_conflicts(
     leds: tuple[Led, ...], width: float, thickness: float, glass: float, distance: float
 ) -> Iterator[Conflict]:

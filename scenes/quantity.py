@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated, NamedTuple
 
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
-CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False)
+from .skin import CONFIG, RefractiveIndex
 
-RefractiveIndex = Annotated[float, Field(ge=1.0, le=4.0)]
+__all__ = ["CONFIG", "Conflict", "Length", "RefractiveIndex", "Wavelength"]
+
 # Bounds far outside of what such a sensor has, so that only slips (a unit, a power of ten) are refused.
 Length = Annotated[float, Field(ge=0.05, le=500.0)]
 Wavelength = Annotated[float, Field(ge=350.0, le=1100.0)]

@@ -18,8 +18,8 @@ Array = NDArray[np.float64]
 Crop = tuple[int, int, int, int]
 
 _WAVEFRONT = 2**21  # light paths in flight: 1 GB at the most
-_MAX_DEPTH = 256  # trapped light takes tens of reflections; what is cut off is below 1e-6
-_ROULETTE_DEPTH = 24
+MAX_DEPTH = 256  # trapped light takes tens of reflections; what is cut off is below 1e-6
+ROULETTE_DEPTH = 24
 
 
 def path_trace(
@@ -54,7 +54,7 @@ def path_trace(
     top, end_row, left, end_column = crop or (0, film_rows, 0, film_columns)
     rows, columns = end_row - top, end_column - left
     pixels = rows * columns
-    integrator = mi.load_dict({"type": "path", "max_depth": _MAX_DEPTH, "rr_depth": _ROULETTE_DEPTH})
+    integrator = mi.load_dict({"type": "path", "max_depth": MAX_DEPTH, "rr_depth": ROULETTE_DEPTH})
     eye = scene.sensors()[0]
 
     per_pass = max(1, min(samples, _WAVEFRONT // pixels))

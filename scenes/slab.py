@@ -5,8 +5,8 @@ wave numbers their inverse. Scattering is isotropic, with reduced coefficients (
 ch. 14; key hulst1980).
 
 Isotropic sources that vary as exp(ikx) meet the kernel of transport, ∫ dµ/(µ² q) exp(-q |z - z'|) over
-0 < µ < 1 with q² = 1/µ² + k²: a problem of one dimension whose "directions" decay at q (Williams 1982; key
-williams1982). On Gauss nodes µ_j with weights w_j (discrete ordinates: Chandrasekhar 1960, ch. III; key
+0 < µ < 1 with q² = 1/µ² + k²: a problem of one dimension whose "directions" decay at q (Rybicki 1971; key
+rybicki1971). On Gauss nodes µ_j with weights w_j (discrete ordinates: Chandrasekhar 1960, ch. III; key
 chandrasekhar1960) its modes exp(-λ z) follow from one symmetric eigenproblem, diag(1/µ²) - a v vᵀ with
 v_j = sqrt(w_j)/µ_j, and λ² = λ²(k = 0) + k² with the same vectors for every k.
 """
@@ -94,7 +94,7 @@ class Slab:
         given = entering * (2.0 * np.sqrt(weight) / mu)[:, None]
         forth = vectors * (q[:, :, None] + rate[:, None, :])
         if np.isinf(self.depth):
-            falling = np.linalg.solve(forth, np.broadcast_to(given, (k.size, *given.shape[-2:])))
+            falling = np.asarray(np.linalg.solve(forth, np.broadcast_to(given, (k.size, *given.shape[-2:]))))
             return falling, np.zeros_like(falling)
         back = vectors * (q[:, :, None] - rate[:, None, :]) * np.exp(-rate * self.depth)[:, None, :]
         given = np.broadcast_to(given, (k.size, *given.shape[-2:]))
@@ -150,8 +150,9 @@ def _ramp(rate: Array, p: Array, depth: float) -> Array:
 def _straight(k: Array, depth: float) -> Array:
     """Fourier transform (n,) of unscattered Lambertian light at the other face.
 
-    That of z² exp(-r)/(π r⁴) at z = d. With exp(-r)/r³ = ∫ exp(-s r)/r² ds, s > 1, and the transform of
-    z exp(-s r)/(π r³) known from above, it is d ∫ (1 - 1/p²) exp(-d sqrt(p² + k²)) dp over p > 1; 2 E3(d) at k = 0.
+    That of z² exp(-r)/(π r⁴) at z = d. With exp(-r)/r³ = ∫ exp(-s r)/r² ds over s > 1 and the transform of
+    z exp(-s r)/(π r³), 2s ∫ exp(-z q)/p² dp over p > s with q² = p² + k², it is
+    d ∫ (1 - 1/p²) exp(-d q) dp over p > 1; 2 E3(d) at k = 0.
     """
     x, w = np.polynomial.legendre.leggauss(8)
     edges = np.concatenate([[0.0], np.geomspace(1e-7, 40.0, 40)])  # of d (q - q(p = 1))

@@ -6,12 +6,13 @@ import re
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .render import PATHS_PER_LED, REFERENCE_SAMPLES, Quality, Renderer, Rendering
+from .render import PATHS_PER_LED, Quality, Renderer, Rendering
 from .sensor import Led, NotModelled, Sensor
 from .spectrum import Band, bands
 
@@ -44,7 +45,7 @@ class SpectralRenderer:
         at
             The sensor at another wavelength, nm; without it the indices stay the same.
         """
-        self.sensor = sensor
+        self.sensor, self._device = sensor, device
         self.bands = bands(sensor.leds, sensor.camera, sensor.wavelength_nm, count)
         self._leds = [_alight(sensor, band) for band in self.bands]
         self.renderers = []
@@ -55,6 +56,12 @@ class SpectralRenderer:
             self.renderers.append(
                 Renderer(replace(there, leds=chosen, wavelength_nm=band.wavelength_nm), device=device)
             )
+
+    @cached_property
+    def whole(self) -> Renderer:
+        """The sensor with all its LEDs at its one wavelength."""
+        alone = self.renderers[0]
+        return alone if len(self.renderers) == 1 else Renderer(self.sensor, device=self._device)
 
     def render(
         self,
@@ -75,11 +82,13 @@ class SpectralRenderer:
         camera = self.sensor.camera
         planes = () if camera.colour == "mono" else (len(camera.channels),)
         radiance = np.zeros((len(self.sensor.leds), *camera.shape, *planes))
+        sinks: NDArray[np.float64] | None = None
+        trapped = np.zeros(len(self.sensor.leds))
         variance, first = 0.0, None
         for number, (band, leds, renderer) in enumerate(
             zip(self.bands, self._leds, self.renderers, strict=True)
         ):
-            whole = samples or PATHS_PER_LED.get(quality, REFERENCE_SAMPLES)
+            whole = samples or PATHS_PER_LED[quality]
             try:
                 one = renderer.render(
                     pressed,
@@ -102,6 +111,11 @@ class SpectralRenderer:
                 radiance[list(leds)] += layers * share[:, :1, None]
             counts = np.tensordot(share.mean(axis=1), layers, 1)
             variance += (0.01 * one.noise_percent * float(np.mean(counts))) ** 2
+            if one.sinks is not None and one.trapped is not None:
+                if sinks is None:
+                    sinks = np.zeros((len(self.sensor.leds), one.sinks.shape[1]))
+                sinks[list(leds)] += band.energy * one.sinks
+                trapped[list(leds)] += band.energy * one.trapped
             first = first or one
         assert first is not None
         noise = 100.0 * np.sqrt(variance) / max(_mean(radiance), 1e-30)
@@ -109,6 +123,8 @@ class SpectralRenderer:
             first,
             radiance=radiance.astype(np.float32),
             noise_percent=float(noise),
+            sinks=sinks,
+            trapped=None if sinks is None else trapped,
             seconds=time.perf_counter() - start,
         )
 

@@ -9,7 +9,7 @@ quantum efficiency, so that a line at that wavelength, best seen, is its own rad
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib.resources import files
 from typing import TYPE_CHECKING, Literal, get_args
@@ -49,11 +49,14 @@ class Band:
         spectrum has other wavelengths.
     parts : int
         Number of bands that share the spectrum of the LEDs lit here.
+    energy : float
+        Share of those LEDs' flux that the band stands for.
     """
 
     wavelength_nm: float
     share: Array
     parts: int
+    energy: float
 
     @property
     def lit(self) -> tuple[int, ...]:
@@ -129,9 +132,7 @@ def bands(leds: Sequence[Led], camera: Camera, wavelength_nm: float, count: int)
             found[key] = _cut(key, camera, wavelength_nm, count, len(leds))
         for band in found[key]:
             band.share[number] = band.share[-1]
-    return [
-        Band(band.wavelength_nm, band.share[:-1], band.parts) for group in found.values() for band in group
-    ]
+    return [replace(band, share=band.share[:-1]) for group in found.values() for band in group]
 
 
 def _cut(
@@ -144,7 +145,7 @@ def _cut(
     weight = response.sum(axis=0)
     if not weight.any():  # the camera is blind to it: dark, and where it would be
         middle = float(np.sum(density * wavelength))
-        return [Band(middle, np.zeros((leds + 1, len(response))), 1)]
+        return [Band(middle, np.zeros((leds + 1, len(response))), 1, 1.0)]
     parts = 1 if wavelength.size == 1 else count
     cuts = np.linspace(0.0, weight.sum(), parts + 1)
     summed = np.concatenate([[0.0], np.cumsum(weight)])
@@ -157,11 +158,12 @@ def _cut(
 
     means = between(weight * wavelength) / between(weight)
     held = np.stack([between(channel) for channel in response])  # (channels, parts)
+    energy = between(density)
     made = []
     for part in range(parts):
         share = np.zeros((leds + 1, len(response)))
         share[-1] = held[:, part]
-        made.append(Band(float(means[part]), share, parts))
+        made.append(Band(float(means[part]), share, parts, float(energy[part])))
     return made
 
 

@@ -1,8 +1,8 @@
 """How light that enters the tissue spreads sideways under the contact before it leaves.
 
-Solves V = R (*) [E + w V] for the light that goes up inside the tissue: what enters (E) and what the face throws
-back (w V; w falls with the real contact) comes up again beside. Where the guide ends, the tissue goes on with
-bare skin.
+Solves V = R (*) [E + w V] for the light that goes up inside the tissue: what enters (E) and what the face
+throws back (w V; w falls with the real contact) comes up again beside. Where the guide ends, the tissue
+goes on with bare skin.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from .tissue import Coupling, TissueOptics
 Array = NDArray[np.float64]
 
 _MOST_ROUNDS = 60
+_BLACK = 1e-12  # share that comes back, below which nothing does
 _NONE = 1e-300  # in place of 0 below a fraction bar
 
 
@@ -85,12 +86,14 @@ class Spread:
         return result
 
     def _conjugate(self, source: Array, excess: Array, tolerance: float) -> Array:
-        """V = M [E + (w - w0) V] by conjugate gradients for x, V = M x, in the product of M (Hestenes & Stiefel
-        1952; key hestenes1952): I - (w - w0) M is self-adjoint and positive there, and a round costs one M.
+        """V = M [E + (w - w0) V] by conjugate gradients for x, V = M x, in the inner product of M.
 
-        M is applied in single precision, always to a residual: the error shrinks with it.
+        There I - (w - w0) M is self-adjoint and positive, and a round costs one M (Hestenes & Stiefel 1952;
+        key hestenes1952). M is applied in single precision, always to a residual: the error shrinks with it.
         """
         residual, found = source, np.zeros_like(source)
+        if np.abs(self.transform).max() < _BLACK:  # a black sheet: no round would get nearer
+            return found
         spread = self.convolve(residual)
         way, spread_way = residual, spread
         power = _dot(residual, spread)

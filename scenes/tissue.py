@@ -5,11 +5,12 @@ step. Light comes in and goes out spread over angles; the reflectance is written
 
     L_up(x, µ) = Σ_i φ_i(µ) V_i(x) / π,    V_i = ρ_i R_i (*) [E_i + Σ_j W_ij V_j],
 
-with µ the cosine in the tissue and E_i = ∫ φ_i T L dω the weighted irradiance that enters. Mode 0 is all that
-forgets its direction: φ_0(µ) is the plane albedo over the total reflectance ρ_0, so that the total is right for
-every angle, and R_0 spreads light over about a millimetre. The others are what single and double scattering
-remember (grazing light leaves at grazing angles): they have no net flux, return within a fraction of a mean
-free path, and are taken as local. W(A_r) is what the face throws back into the tissue.
+with µ the cosine in the tissue and E_i = ∫ φ_i T L dω the weighted irradiance that enters. Mode 0 is all
+that forgets its direction: φ_0(µ) is the plane albedo over the total reflectance ρ_0, so that the total is
+right for every angle, and R_0 spreads light over about a millimetre. The others are what light scattered a
+few times remembers (grazing light leaves at grazing angles): they have no net flux, return within a fraction
+of a mean free path, and are taken as local. Mode 1 makes what leaves towards the camera right for light from
+any angle; the next are the largest of what is left. W(A_r) is what the face throws back into the tissue.
 """
 
 from __future__ import annotations
@@ -23,13 +24,14 @@ from numpy.typing import NDArray
 from .contact import ContactOptics, moment_weights
 from .ftir import gap_transmittance
 from .radial import Kernel, kernel
-from .sensor import Skin, Tissue
+from .skin import Skin, Tissue
 from .slab import Slab, cosines, decay_rate
 
 Array = NDArray[np.float64]
 
 MODES = 2
 _COSINES = 513
+_CAMERA = 0.985  # cosine in the tissue at which mode 1 is exact: what the camera sees
 _LEAST = 1e-12  # reflectance below which nothing comes back
 
 
@@ -132,24 +134,30 @@ def tissue_optics(
     if total < _LEAST:
         lobes = np.vstack([np.ones((1, _COSINES)), np.zeros((modes - 1, _COSINES))])
         return TissueOptics(transport, body, curve, np.zeros(modes), lobes)
-    at_nodes, at_grid = body.factors(mu), body.factors(grid)
-    plane, shape = at_nodes @ even / total, at_grid @ even / total
-    rest = at_nodes - total * np.outer(plane, plane)
-    root = np.sqrt(even)
-    values, vectors = np.linalg.eigh(0.5 * (rest + rest.T) * np.outer(root, root))
-    order = np.argsort(-np.abs(values))[: modes - 1]
-    strengths, modes_of = [total], [shape]
-    for number in order:
-        on_nodes = vectors[:, number] / root
-        extended = (at_grid - total * np.outer(shape, plane)) @ (even * on_nodes) / values[number]
-        strengths.append(values[number])
-        modes_of.append(extended * np.sign(extended[1]))
-    return TissueOptics(transport, body, curve, np.array(strengths), np.stack(modes_of))
+    nodes, out = body.factors(mu), body.factors(grid)  # (to, from) cosines
+    plane, shape = nodes @ even / total, out @ even / total
+    strengths, shapes = [total], [shape]
+    nodes, out = nodes - total * np.outer(plane, plane), out - total * np.outer(shape, plane)
+    camera, root = int(np.argmin(np.abs(mu - _CAMERA))), np.sqrt(even)
+    for number in range(1, modes):
+        values, vectors = np.linalg.eigh(0.5 * (nodes + nodes.T) * np.outer(root, root))
+        largest = int(np.argmax(np.abs(values)))
+        strength, on_nodes = values[largest], vectors[:, largest] / root
+        on_grid = out @ (even * on_nodes) / strength
+        norm = even @ nodes[:, camera] ** 2
+        if number == 1 and 0.0 < norm < 3.0 * abs(strength) * nodes[camera, camera]:
+            strength = norm / nodes[camera, camera]
+            on_nodes, on_grid = nodes[:, camera] / np.sqrt(norm), out[:, camera] / np.sqrt(norm)
+        strengths.append(float(strength))
+        shapes.append(on_grid)
+        nodes = nodes - strength * np.outer(on_nodes, on_nodes)
+        out = out - strength * np.outer(on_grid, on_nodes)
+    return TissueOptics(transport, body, curve, np.array(strengths), np.stack(shapes))
 
 
 @lru_cache(maxsize=16)
 def body_behind(skin: Skin, tissue: Tissue) -> tuple[float, TissueOptics]:
-    """Refractive index and optics of what the light enters: the contact sheet if there is one, or the tissue."""
+    """Refractive index and optics of what the light enters: the contact sheet, or without one the tissue."""
     sheet = skin.sheet
     if sheet is None:
         return tissue.refractive_index, tissue_optics(tissue.scattering_per_mm, tissue.absorption_per_mm)
@@ -176,7 +184,7 @@ def couple(optics: ContactOptics, tissue: TissueOptics, n_guide: float, n_tissue
 
 
 def _passed_by_bare_skin(tissue: TissueOptics, n_tissue: float) -> Array:
-    """⟨φ_i φ_j T⟩ of a face to air, (modes, modes): T is nothing beyond the critical angle, so start there."""
+    """⟨φ_i φ_j T⟩ of a face to air, (modes, modes); T starts at the critical angle."""
     critical = np.sqrt(1.0 - 1.0 / n_tissue**2)
     x, w = np.polynomial.legendre.leggauss(200)
     inner = 0.5 * (1.0 + x)

@@ -139,7 +139,7 @@ def walk(
         direction = dr.select(on_contact, mi.reflect(si.wi), direction)
         kept = dr.select(on_contact, throughput - entering, throughput * share)
         stopped = dr.select(elsewhere, throughput - kept, 0.0)
-        on_led = _one_of(si.shape, named, "led_")
+        on_led = one_of(si.shape, named, "led_")
         sink["leds"] += dr.select(on_led, stopped, 0.0)
         sink["walls"] += dr.select(on_wall, stopped, 0.0)
         sink["frame"] += dr.select(on_led | on_wall, 0.0, stopped)
@@ -198,7 +198,7 @@ def re_emit(
 ) -> tuple[mi.Ray3f, mi.Float]:
     """Rays from the contact surface as the tissue re-emits light, and what each carries, times their number.
 
-    Even over the guide's face, directions as T(cos) cos, weight as L = (n1/n3)² T(cos) sum phi_i(cos) V_i / pi;
+    Even over the guide's face, directions as T(cos) cos, weight as L = (n1/n3)² T sum phi_i(cos) V_i / pi;
     `upward` is V (n_led, modes, m, m), W/mm², on cells [iy, ix] of the guide's face.
     """
     width = sensor.guide.width_mm
@@ -264,7 +264,7 @@ def bounce_off(
 ) -> tuple[mi.Vector3f, mi.Float, mi.Bool]:
     """Direction (local) and share of the light after a face that is not the contact, and whether it is a side
     wall."""
-    on_wall = active & _one_of(si.shape, named, "wall_")
+    on_wall = active & one_of(si.shape, named, "wall_")
     painted = _painted(sensor, si, on_wall)
     context = mi.BSDFContext(mi.TransportMode.Importance)
     scattered, weight = si.bsdf(ray).sample(context, si, sample1, sample2, active & ~painted)
@@ -291,7 +291,7 @@ def _painted(sensor: Sensor, si: mi.SurfaceInteraction3f, on_wall: mi.Bool) -> m
     return painted
 
 
-def _one_of(shape: mi.ShapePtr, named: dict[str, mi.ShapePtr], prefix: str) -> mi.Bool:
+def one_of(shape: mi.ShapePtr, named: dict[str, mi.ShapePtr], prefix: str) -> mi.Bool:
     """Whether a shape is one of those whose name begins so."""
     found = mi.Bool(False)
     for name, pointer in named.items():

@@ -1,7 +1,7 @@
 """Light in a scattering body, scattering by scattering: the volumetric reference, by Monte Carlo.
 
-The body fills z > 0 behind its face z = 0, mm; +z points into it. It knows nothing of `slab` and `tissue`, whose
-independent check it is. Import only after a variant is set (`scenes.backend.use`).
+The body fills z > 0 behind its face z = 0, mm; +z points into it. It knows nothing of `slab` and `tissue`,
+whose independent check it is. Import only after a variant is set (`scenes.backend.use`).
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ def walk(
     edges = (
         np.geomspace(0.05, 20.0, 41) / transport if edges_mm is None else np.asarray(edges_mm, dtype=float)
     )
-    random = _random(photons, seed)
+    random = generator(photons, seed)
     along, around = random.next_float32(), random.next_float32()
     if entry is None:
         direction = mi.warp.square_to_cosine_hemisphere(mi.Point2f(along, around))
@@ -161,8 +161,8 @@ def roam(
 ) -> tuple[mi.Point3f, mi.Vector3f, mi.Float, mi.Float, mi.PCG32]:
     """Follow light from points on or below the face until it leaves or is absorbed.
 
-    Free paths are drawn for the densest medium; what collides elsewhere does so in proportion (delta tracking:
-    Woodcock et al. 1965; key woodcock1965). A collision keeps the share µs/µt of the light.
+    Free paths are drawn for the densest medium; what collides elsewhere does so in proportion (delta
+    tracking: Woodcock et al. 1965; key woodcock1965). A collision keeps the share µs/µt of the light.
 
     Returns
     -------
@@ -246,9 +246,8 @@ def roam(
 def fresnel(n_body: float, n_before: float) -> Passing:
     """A plain face between two indices, unpolarised (Born & Wolf 1999, ch. 1; key born1999)."""
     cosine = np.linspace(0.0, 1.0, _ANGLES) ** 2  # crowded at grazing angles
-    table = mi.Float(
-        (0.5 * sum(gap_transmittance(n_body, n_before, n_before, 0.0, cosine, 550.0))).astype(np.float32)
-    )
+    t_s, t_p = gap_transmittance(n_body, n_before, n_before, 0.0, cosine, 550.0)
+    table = mi.Float((0.5 * np.asarray(t_s + t_p)).astype(np.float32))
 
     def passing(where: mi.Point3f, cosine: mi.Float) -> mi.Float:
         at = dr.sqrt(dr.clip(cosine, 0.0, 1.0)) * (_ANGLES - 1)
@@ -257,6 +256,17 @@ def fresnel(n_body: float, n_before: float) -> Passing:
         return dr.lerp(low, high, at - mi.Float(node))
 
     return passing if n_body != n_before else lambda where, cosine: mi.Float(1.0)
+
+
+def behind_guide(n_body: float, n_guide: float, transmittance: Passing) -> Passing:
+    """A face whose transmittance is known for cosines in the guide (`bsdf.Table`): the same both ways."""
+    square = (n_body / n_guide) ** 2
+
+    def passing(where: mi.Point3f, cosine: mi.Float) -> mi.Float:
+        inside = 1.0 - square * (1.0 - dr.square(cosine))
+        return dr.select(inside > 0.0, transmittance(where, dr.safe_sqrt(inside)), 0.0)
+
+    return passing
 
 
 def _collision(medium: Medium, majorant: float) -> tuple[float, float, float]:
@@ -277,7 +287,8 @@ def _scattered(g: mi.Float, u1: mi.Float, u2: mi.Float, isotropic: bool) -> mi.V
     return mi.Vector3f(sine * c, sine * s, cosine)
 
 
-def _random(lanes: int, seed: int) -> mi.PCG32:
+def generator(lanes: int, seed: int) -> mi.PCG32:
+    """Random numbers for so many lanes, which depend on the seed and nothing else."""
     sequence = dr.arange(mi.UInt64, lanes) + 1
     return mi.PCG32(size=lanes, initstate=dr.opaque(mi.UInt64, seed), initseq=sequence)
 

@@ -9,7 +9,8 @@ import numpy as np
 import pyvista as pv
 
 from scenes.contact import ContactOptics, contact_optics
-from scenes.sensor import Camera, Glass, Guide, Led, Sensor, Side, Skin, Tissue
+from scenes.sensor import Camera, Glass, Guide, Led, Sensor, Side
+from scenes.skin import Skin, Tissue
 
 HALF_MM = 12.5
 ALBEDO = 0.68

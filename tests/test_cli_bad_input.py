@@ -160,8 +160,8 @@ DESIGNS = {
         ["specimen.sides", "'glued'", "'symmetric'"],
     ),
     "a nested surprise": (
-        mine("albedo = 0.68", "albedo = {a = [1, {b = 2}]}"),
-        ["specimen.albedo", "a number"],
+        mine("anisotropy = 0.0", "anisotropy = {a = [1, {b = 2}]}"),
+        ["specimen.anisotropy", "a number"],
     ),
     "nothing at all": ("", ["nothing", "(+4 more)"]),
 }

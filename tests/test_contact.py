@@ -5,8 +5,9 @@ import pytest
 from scipy.integrate import simpson
 
 from scenes import contact
-from scenes.contact import ContactOptics, contact_fraction, contact_optics, mean_gap_um
+from scenes.contact import ContactOptics, contact_fraction, contact_optics, mean_gap_um, real_contact
 from scenes.ftir import gap_transmittance
+from scenes.skin import Skin
 
 Array = np.ndarray
 
@@ -268,3 +269,47 @@ def test_gain_is_the_scattering_ratio_when_nothing_comes_back_twice() -> None:
     """To first order in the albedo, K = (n1/n3)² albedo."""
     optics = contact_optics(*DRY, 1e-6, RMS_UM, WAVELENGTH)
     np.testing.assert_allclose(optics.diffuse_gain, (1.4336 / 1.40) ** 2 * 1e-6, rtol=2e-6)
+
+
+# states of the surface
+
+
+def test_full_contact_is_all_or_nothing() -> None:
+    pressure = np.array([-1.0, 0.0, 1e-6, 0.5, 50.0])
+    closed = real_contact(pressure, Skin(contact="full"), 5.55)
+    np.testing.assert_array_equal(closed, [0.0, 0.0, 1.0, 1.0, 1.0])
+    rough = real_contact(pressure, Skin(), 5.55)
+    np.testing.assert_array_equal(rough, contact_fraction(pressure, 5.55, 2.0, 1.6))
+
+
+@pytest.mark.parametrize("media", [DRY, WET])
+def test_dust_lets_through_what_wide_gaps_do(media: tuple[float, float, float]) -> None:
+    """Nothing beyond the critical angle, whatever the pressure; below it two faces without fringes.
+
+    Incoherent light between them sums to 1/T = 1/T_12 + 1/T_23 - 1, for s and p on their own.
+    """
+    all_dust = contact_optics(*media, 0.68, RMS_UM, WAVELENGTH, dust=1.0).transmittance
+    assert np.ptp(all_dust, axis=0).max() == 0.0
+    cosine = np.linspace(0.0, 1.0, all_dust.shape[1])
+    dark = cosine < kinks(media)[0]
+    assert np.all(all_dust[0, dark] == 0.0)
+    cosine = cosine[~dark][3:]
+    between = np.sqrt(1.0 - (media[0] / media[1]) ** 2 * (1.0 - cosine**2))
+    first = gap_transmittance(media[0], media[1], media[1], 0.0, cosine, WAVELENGTH)
+    second = gap_transmittance(media[1], media[2], media[2], 0.0, between, WAVELENGTH)
+    washed = np.mean([1 / (1 / a + 1 / b - 1) for a, b in zip(first, second, strict=True)], axis=0)
+    np.testing.assert_allclose(all_dust[0, ~dark][3:], washed, atol=1e-4)
+
+
+def test_dust_takes_its_share_of_the_mean_not_of_the_contact() -> None:
+    clean, dusty, dust = (contact_optics(*DRY, 0.68, RMS_UM, WAVELENGTH, dust=d) for d in (0.0, 0.25, 1.0))
+    mixed = 0.75 * clean.transmittance + 0.25 * dust.transmittance
+    np.testing.assert_allclose(dusty.transmittance, mixed, atol=1e-14)
+
+
+def test_wet_gaps_let_more_light_through_and_hold_less_back() -> None:
+    """Water in the gaps moves the critical angle from 46 to 68 degrees from the normal."""
+    dry, wet = (contact_optics(*media, 0.68, RMS_UM, WAVELENGTH) for media in (DRY, WET))
+    assert np.all(wet.hemispherical >= dry.hemispherical - 1e-12)
+    assert wet.hemispherical[0] > 1.5 * dry.hemispherical[0]
+    assert kinks(WET)[0] == pytest.approx(np.sqrt(1 - (1.33 / 1.4336) ** 2))

@@ -15,7 +15,7 @@ def of(body: Slab) -> Kernel:
 
 
 def test_known_pairs_come_back() -> None:
-    """exp(-b r)/(2π r) <-> 1/sqrt(k² + b²), b² K0(b r) .. <-> 1/(k² + b²), at rates that the tail does not have."""
+    """exp(-b r)/(2π r) <-> 1/sqrt(k² + b²), K0(b r)/2π <-> 1/(k² + b²), at rates other than the tail's."""
     mixed = kernel(lambda k: 1 / np.sqrt(k**2 + 0.3**2) + 2 / (k**2 + 0.5**2), 1.0, 0.3, 1.0)
     r = np.array([0.01, 0.1, 1.0, 5.0, 20.0])  # the taper shows where the profile has fallen by exp(-6)
     exact = np.exp(-0.3 * r) / (2 * np.pi * r) + 2 * k0(0.5 * r) / (2 * np.pi)

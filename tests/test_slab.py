@@ -13,8 +13,8 @@ Array = np.ndarray
 def h_function(q: Array, albedo: float, k: float = 0.0) -> Array:
     """H for kernels exp(-q z) at lateral wave number k; Chandrasekhar's H(µ = 1/q) at k = 0.
 
-    ln H = -(q/π) ∫ ln(1 - a atan(κ)/κ) / (q² + t²) dt over t > 0 with κ² = t² + k² (Chandrasekhar 1960, ch. V, by
-    the Wiener-Hopf factorisation of the kernel's transform).
+    ln H = -(q/π) ∫ ln(1 - a atan(κ)/κ) / (q² + t²) dt over t > 0 with κ² = t² + k² (Chandrasekhar 1960,
+    ch. V, by the Wiener-Hopf factorisation of the kernel's transform).
     """
     node, weight = np.polynomial.legendre.leggauss(400)
     angle, weight = 0.25 * np.pi * (1.0 + node), 0.25 * np.pi * weight

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from scenes.contact import contact_optics, moment_weights
-from scenes.sensor import Sheet, Skin, Tissue
+from scenes.skin import Sheet, Skin, Tissue
 from scenes.slab import Slab
 from scenes.tissue import Coupling, TissueOptics, body_behind, couple, tissue_optics
 
@@ -19,7 +19,7 @@ def behind(tissue: TissueOptics, n_tissue: float = N3, **skin: float) -> Couplin
 
 
 def out_and_in(coupling: Coupling, dust: float = 0.0) -> np.ndarray:
-    """(n_fraction, modes): what leaves of each mode, (n1/n3)² times the Lambertian mean of T φ on the guide's side."""
+    """What leaves of each mode, (n_fraction, modes): (n1/n3)² times the guide's Lambertian mean of T φ."""
     optics = contact_optics(N1, 1.0, N3, 0.5, 10.0, 550.0, dust=dust)
     cosine = np.linspace(0.0, 1.0, optics.transmittance.shape[1])
     weights = 2 * moment_weights(cosine)
@@ -49,9 +49,9 @@ def test_modes_have_the_plane_albedo_and_no_net_flux() -> None:
     np.testing.assert_allclose(tissue.reflectance * lobes[0], Slab(1 / 1.02).plane_albedo(mu), rtol=2e-4)
 
 
-@pytest.mark.parametrize(("modes", "worst"), [(1, 0.05), (2, 0.008), (3, 0.002)])
+@pytest.mark.parametrize(("modes", "worst"), [(1, 0.05), (2, 1e-3), (3, 1e-3)])
 def test_two_modes_give_what_trapped_light_leaves_for_the_camera(modes: int, worst: float) -> None:
-    """In at cosines below 0.7, as trapped light does, out above 0.9, as the camera sees; on the exact factors."""
+    """In at cosines below 0.7, as trapped light, out above 0.9, as the camera sees; by the exact factors."""
     node, weight = np.polynomial.legendre.leggauss(40)
     mu, weight = 0.5 * (1 + node), weight
     tissue = tissue_optics(1.0, 0.02, modes=modes)
@@ -115,7 +115,7 @@ def test_sheet_takes_the_tissues_place() -> None:
 def test_thick_sheet_is_tissue_and_a_black_one_gives_nothing() -> None:
     deep, half = tissue_optics(1.0, 0.02, 80.0), tissue_optics(1.0, 0.02)
     r = np.array([0.1, 1.0, 5.0])
-    np.testing.assert_allclose(deep.profile(r), half.profile(r), rtol=1e-6)
+    np.testing.assert_allclose(deep.profile(r), half.profile(r), rtol=1e-5)
     np.testing.assert_allclose(deep.lobes[0], half.lobes[0], rtol=1e-6)
     black = tissue_optics(0.0, 30.0, 0.3)
     assert black.reflectance == 0.0 and np.all(behind(black).gain == 0.0)

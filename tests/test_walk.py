@@ -1,18 +1,19 @@
 """The volumetric walk against published values, and the standard kernel against the walk."""
 
+import dataclasses
 from types import ModuleType
-from typing import Any
 
 import numpy as np
 import pytest
 
 from scenes.contact import contact_optics
 from scenes.ftir import gap_transmittance
-from scenes.slab import Slab, cosines
+from scenes.slab import Slab
 from scenes.spread import spreader
-from scenes.tissue import couple, tissue_optics
+from scenes.tissue import TissueOptics, couple, tissue_optics
 
 PHOTONS = 400_000
+N1, N3 = 1.4336, 1.40
 
 
 @pytest.fixture
@@ -32,14 +33,14 @@ def reflected(
     return mirror + (1 - mirror) * share, error
 
 
-# (albedo, g, index, total reflectance at normal incidence of a half-space), mirror reflection included. The first is
-# Giovanelli's (1955; key giovanelli1955), as in Wang, Jacques & Zheng (1995; key wang1995); the second and third
-# stand in the tests of iadpython, the rest were computed with it (0.5.3, 32 angles), an independent code for adding
-# and doubling (Prahl, van Gemert & Welch 1993; key prahl1993).
+# (albedo, g, index, total reflectance at normal incidence of a half-space), mirror reflection included. The
+# first is Giovanelli's (1955; key giovanelli1955), as in Wang, Jacques & Zheng (1995; key wang1995); the
+# second stands in the tests of iadpython, the rest were computed with it (0.5.3, 32 angles): an independent
+# code for adding and doubling (Prahl, van Gemert & Welch 1993; key prahl1993).
 PUBLISHED = [
     (0.9, 0.0, 1.5, 0.2600),
     (0.8, 0.0, 1.0, 0.28525),
-    (0.6, 0.0, 1.33, 0.10275),
+    (0.6, 0.0, 1.33, 0.10285),
     (0.98, 0.0, 1.4, 0.53159),
     (0.95, 0.5, 1.4, 0.27593),
     (0.99, 0.9, 1.4, 0.27868),
@@ -56,7 +57,7 @@ def test_half_space_reflects_as_published(
 
 
 def test_slab_reflects_and_passes_as_published(steps: ModuleType) -> None:
-    """µa = 1, µs = 9 per mm, g = 0.75, 0.2 mm, matched: van de Hulst (1980; key hulst1980), by Wang et al. (1995)."""
+    """µa 1, µs 9 per mm, g 0.75, 0.2 mm, matched: van de Hulst (1980; key hulst1980), in wang1995."""
     body = steps.Body(steps.Medium(9.0, 1.0, 0.75), thickness_mm=0.2)
     walked = steps.walk(body, 1_000_000, 1, entry=1.0)
     assert walked.reflectance[0] == pytest.approx(0.09739, rel=0.01)
@@ -118,60 +119,105 @@ def test_modes_and_face_together_are_the_walk_under_a_real_face(steps: ModuleTyp
     held = np.einsum("m,im,jm->ij", weight * mu * (1 - passes), lobes, lobes)
     rho = np.diag(tissue.strengths)
     upward = np.linalg.solve(np.eye(2) - rho @ held, rho[:, 0])
-    assert (weight * mu * passes * lobes).sum(axis=1) @ upward == pytest.approx(
-        walked.reflectance[0], rel=0.003
-    )
+    assert leaving(tissue, n_before) @ upward == pytest.approx(walked.reflectance[0], rel=0.003)
 
 
 def test_spread_is_the_walk_under_a_face_that_changes_from_place_to_place(
     steps: ModuleType, variant: str
 ) -> None:
-    """Light enters evenly between x = -4 and 0; right of 0 the face is the guide's at full contact, left of it in
-    air. What is left of the light is compared strip by strip, 1 mm wide, within 1 % of the brightest."""
+    """Light enters evenly between x = -4 and 0; right of 0 lies the guide in full contact, left of it air.
+
+    What leaves is compared strip by strip, 1 mm wide: all of it within 0.4 %, a strip within 2.5 % of the
+    brightest. Light that was mirrored inside leaves 2 % too near, since R knows no angles.
+    """
+    import drjit as dr
     import mitsuba as mi
 
-    n1, n3, width, cells = 1.4336, 1.40, 40.0, 160
-    guide, air = steps.fresnel(n3, n1), steps.fresnel(n3, 1.0)
-
-    def passing(where: Any, cosine: Any) -> Any:
-        import drjit as dr
-
-        return dr.select(where.x > 0.0, guide(where, cosine), air(where, cosine))
-
+    guide, air = steps.fresnel(N3, N1), steps.fresnel(N3, 1.0)
     photons = 1_000_000
-    random = steps._random(photons, 6)
-    u, v, s, t = (random.next_float32() for _ in range(4))
-    start = mi.Point3f(4.0 * (u - 1.0), 0.0 * v, 0.0 * v)
+    random = steps.generator(photons, 6)
+    u, s, t = (random.next_float32() for _ in range(3))
+    start = mi.Point3f(4.0 * (u - 1.0), 0.0, 0.0)
     down = mi.warp.square_to_cosine_hemisphere(mi.Point2f(s, t))
-    place, _, weight, _ = steps.roam(steps.Body(steps.Medium(1.0, 0.02)), start, down, random, passing)
+    place, _, weight, _, _ = steps.roam(
+        steps.Body(steps.Medium(1.0, 0.02)),
+        start,
+        down,
+        random,
+        lambda where, cosine: dr.select(where.x > 0.0, guide(where, cosine), air(where, cosine)),
+    )
     strips = np.arange(-10.0, 10.5, 1.0)
-    walked, _ = np.histogram(np.array(place.x), strips, weights=np.array(weight) / photons)
+    share = np.array(weight, dtype=float) / photons
+    walked, _ = np.histogram(np.array(place.x), strips, weights=share)
 
-    optics = contact_optics(n1, 1.0, n3, 0.5, 10.0, 550.0)
+    width, cells = 40.0, 160
     tissue = tissue_optics(1.0, 0.02)
-    coupling = couple(optics, tissue, n1, n3)
-    spread = spreader(tissue, coupling, width, cells)
-    # bare skin in the table: a node of its own, in the place of no contact
-    held = np.stack([coupling.free, coupling.held[-1]])
-    from scenes.spread import Spread, _without_local
-
-    two = Spread(spread.transform, cells, spread.free, *_without_local(tissue.strengths, held))
+    coupling = couple(contact_optics(N1, 1.0, N3, 0.5, 10.0, 550.0), tissue, N1, N3)
+    bare = dataclasses.replace(coupling, held=np.stack([coupling.free, coupling.held[-1]]))  # A_r = 0: air
     x = (np.arange(cells) + 0.5) / cells * width - width / 2
     entering = np.zeros((1, 2, cells, cells))
-    entering[0, 0, :, (x > -4.0) & (x < 0.0)] = 1.0 / (
-        4.0 * width
-    )  # a long strip: the sum over y is the line
+    entering[0, 0, :, (x > -4.0) & (x < 0.0)] = 1.0 / 4.0  # long in y: each row is a line
     contact = np.broadcast_to(np.where(x > 0.0, 1.0, 0.0), (cells, cells))
-    upward = two.solve(entering, contact)[0]
-    mu, weights = cosines()
-    overlap = np.einsum("m,im,jm->ij", 2 * mu * weights, tissue.lobe(mu), tissue.lobe(mu))
-    leaving = np.stack([(overlap - part)[0] for part in held])
-    rows = slice(3 * cells // 8, 5 * cells // 8)  # far from the strip's ends
-    line = upward[:, rows].mean(axis=1) * width * width / cells
-    left = np.where(x > 0.0, leaving[1] @ line, leaving[0] @ line)
+    line = spreader(tissue, bare, width, cells).solve(entering, contact)[0, :, cells // 2] * width / cells
+    left = np.where(x > 0.0, leaving(tissue, N1) @ line, leaving(tissue, 1.0) @ line)
     model = np.array([left[(x > a) & (x < a + 1.0)].sum() for a in strips[:-1]])
-    np.testing.assert_allclose(model, walked, atol=0.01 * walked.max())
-    assert model.sum() == pytest.approx(walked.sum(), rel=0.004)
+    assert left.sum() == pytest.approx(share.sum(), rel=0.004)
+    np.testing.assert_allclose(model, walked, atol=0.025 * walked.max())
+
+
+@pytest.mark.parametrize("fraction", [0.25, 0.5])
+def test_trapped_light_comes_back_to_the_camera_as_the_walk_says(steps: ModuleType, fraction: float) -> None:
+    """Trapped light (cosines 0.25 to 0.7 in the guide) enters a rough contact, evenly over the face.
+
+    What leaves within 20 degrees of the normal, where the camera is, agrees within 0.5 %, and all of it
+    within 0.4 %. Lambertian tissue of the same total is 2 % (a quarter in contact) to 6 % (all) too bright.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    from scenes.bsdf import Table
+
+    optics = contact_optics(N1, 1.0, N3, 0.5, 10.0, 550.0)
+    table, share = Table(Table.pack(optics)), mi.Float(fraction)
+    photons, low, high = 2_000_000, 0.25, 0.7
+    random = steps.generator(photons, 8)
+    s, t = random.next_float32(), random.next_float32()
+    cosine = dr.sqrt(low**2 + (high**2 - low**2) * s)
+    sine = N1 / N3 * dr.sqrt(1.0 - cosine * cosine)
+    across, along = dr.sincos(dr.two_pi * t)
+    inward = mi.Vector3f(sine * along, sine * across, dr.sqrt(1.0 - sine * sine))
+    face = steps.behind_guide(N3, N1, lambda where, cos: table.transmittance(share, cos))
+    body = steps.Body(steps.Medium(1.0, 0.02))
+    _, leaves, weight, _ = steps.roam(body, dr.zeros(mi.Point3f, photons), inward, random, face)
+    light = np.array(weight * table.transmittance(share, cosine), dtype=float) / photons
+    outside = 1.0 - (N3 / N1) ** 2 * (
+        1.0 - np.array(leaves.z, dtype=float) ** 2
+    )  # squared cosine in the guide
+    to_camera = np.cos(np.deg2rad(20.0)) ** 2
+    walked = light.sum(), light[outside > to_camera].sum()
+
+    tissue = tissue_optics(1.0, 0.02)
+    coupling = couple(optics, tissue, N1, N3)
+    node = round(128 * fraction)
+    grid, passes = np.linspace(0, 1, 1025), optics.transmittance[node]
+
+    def mean(start: float, stop: float) -> np.ndarray:
+        """⟨T φ_i⟩ over even steps of the squared cosine, (modes,)."""
+        cos = np.sqrt(start + (stop - start) * (np.arange(4000) + 0.5) / 4000)
+        lobes = np.stack([np.interp(cos, grid, lobe) for lobe in coupling.lobes])
+        return np.mean(np.interp(cos, grid, passes) * lobes, axis=1)
+
+    answer = coupling.gain[node] @ mean(low**2, high**2)
+    assert mean(0.0, 1.0) @ answer == pytest.approx(walked[0], rel=0.004)
+    assert mean(to_camera, 1.0) @ answer * (1.0 - to_camera) == pytest.approx(walked[1], rel=0.005)
+
+
+def leaving(tissue: TissueOptics, n_before: float) -> np.ndarray:
+    """⟨φ_i T⟩ of a plain face to an index, (modes,)."""
+    node, weight = np.polynomial.legendre.leggauss(1000)
+    mu = 0.5 * (1 + node)
+    passes = 0.5 * sum(gap_transmittance(N3, n_before, n_before, 0.0, mu, 550.0))
+    return (weight * mu * passes * tissue.lobe(mu)).sum(axis=1)
 
 
 def test_a_ball_of_the_same_medium_changes_nothing_and_one_that_holds_all_is_the_medium(
@@ -189,7 +235,7 @@ def test_a_ball_of_the_same_medium_changes_nothing_and_one_that_holds_all_is_the
 
 
 def test_dark_ball_darkens_less_the_deeper_it_lies(steps: ModuleType) -> None:
-    medium, dark = steps.Medium(1.0, 0.01), steps.Medium(1.0, 5.0)
+    medium, dark = steps.Medium(1.0, 0.05), steps.Medium(1.0, 5.0)
     balls = [steps.Ball((0.0, 0.0, depth + 2.0), 2.0, dark) for depth in (0.5, 2.0, 8.0)]
     shares = [steps.walk(steps.Body(medium, ball=ball), PHOTONS, 11).reflectance for ball in balls]
     plain = steps.walk(steps.Body(medium), PHOTONS, 11).reflectance

@@ -36,15 +36,34 @@ examples:
   twin simulate my-sensor.toml --no-inclusion --force 0.5 --mechanics linear --out flat
 """
 
+_CHECK = """\
+Look a sensor over, on its press and a standard inclusion (10 mm across, 5 mm deep, 100 kPa), at preview
+quality: where each LED's light goes, in per cent of what it emits; exposure; signal over noise; and what is
+wrong, errors first, each with why it matters and what to change. Exit status 0 also where something is wrong;
+2 where the design cannot be read. With --out, check.json and check.png: sample light paths and the balance.
+
+examples:
+  twin check tsis
+  twin check my-sensor.toml --indentation 3 --out checked
+  twin check tsis --json | jq .findings
+"""
+
 _EXPORT = """\
-Press a sensor on a slab of tissue and write the mechanics for other programs: displacement, stress and
-materials throughout as VTU, which ParaView opens, or the same press, with and without the inclusion, as
-input decks of CalculiX. No light is computed. Lengths are mm, moduli kPa.
+Press a sensor on a slab of tissue and write it for other programs; no light is computed. Lengths are mm,
+moduli kPa.
+  --vtu      displacement, stress and materials throughout, which ParaView opens
+  --ccx      the same press, with and without the inclusion, as input decks of CalculiX
+  --mitsuba  the scene as XML, PLY and a table, which the stock mitsuba package loads with mi.load_file; our
+             plugins are registered by one import after mi.set_variant("llvm_ad_mono"): import scenes.plugins
+  --stl      guide, contact surface and glass as meshes
+  --ply      the same, with pressure and real contact fraction at the contact surface's vertices
 
 examples:
   twin export --size 10 --depth 5 --modulus 100 --indentation 2 --vtu press.vtu
   twin export my-sensor.toml --no-inclusion --tilt 0 3 --mechanics linear --vtu tilted.vtu
   twin export tsis --size 10 --depth 5 --modulus 100 --indentation 1 2 3 --ccx decks
+  twin export tsis --size 10 --depth 5 --modulus 100 --mitsuba scene
+  twin export tsis --no-inclusion --ply meshes
 """
 
 _SCHEMA = """\
@@ -93,7 +112,22 @@ def _parser() -> Parser:
     )
     _add_run_flags(simulate)
 
-    export = _verb(verbs, "export", "a press as files for ParaView or CalculiX", _EXPORT)
+    check = _verb(verbs, "check", "where the light goes, exposure, signal, mistakes: with advice", _CHECK)
+    check.add_argument(
+        "design", metavar="DESIGN", nargs="?", default="tsis", help="name or TOML file (default tsis)"
+    )
+    _add_mechanics_flag(check, "linear")
+    check.add_argument(
+        "--indentation",
+        type=number(above=0.0),
+        metavar="MM",
+        help="depth of the press (default: the design's deepest)",
+    )
+    check.add_argument("--json", action="store_true", help="print JSON instead of tables")
+    check.add_argument("--out", metavar="DIR", help="new folder for check.json and check.png")
+    _add_light_flags(check)
+
+    export = _verb(verbs, "export", "a press as files for ParaView, CalculiX, Mitsuba", _EXPORT)
     export.add_argument(
         "design", metavar="DESIGN", nargs="?", default="tsis", help="name or TOML file (default tsis)"
     )
@@ -103,6 +137,9 @@ def _parser() -> Parser:
     kind = export.add_mutually_exclusive_group()
     kind.add_argument("--vtu", metavar="FILE.vtu", help="volume results of one press, for ParaView")
     kind.add_argument("--ccx", metavar="DIR", help="input decks for CalculiX, one step per press depth")
+    kind.add_argument("--mitsuba", metavar="DIR", help="one press as a scene for the stock mitsuba package")
+    kind.add_argument("--stl", metavar="DIR", help="one press as STL meshes")
+    kind.add_argument("--ply", metavar="DIR", help="one press as PLY meshes with fields")
     _add_quality_flag(export)
 
     _verb(verbs, "schema", "the JSON schema of a design file", _SCHEMA)
@@ -137,14 +174,20 @@ def _add_inclusion_flags(parser: Parser) -> None:
 
 
 def _add_pose_flags(parser: Parser) -> None:
+    _add_mechanics_flag(parser)
+    _add_pair(parser, "--tilt", "turn of the sensor about x, then y, degrees (default: the design's)")
+    _add_pair(parser, "--position", "sensor's centre minus the specimen's, mm (default: the design's)")
+
+
+def _add_mechanics_flag(parser: Parser, default: str | None = None) -> None:
+    otherwise = default or "the design's"
     parser.add_argument(
         "--mechanics",
         type=choice(*MECHANICS),
+        default=default,
         metavar="M",
-        help=" or ".join(MECHANICS) + " strain (default: the design's)",
+        help=f"{' or '.join(MECHANICS)} strain (default: {otherwise})",
     )
-    _add_pair(parser, "--tilt", "turn of the sensor about x, then y, degrees (default: the design's)")
-    _add_pair(parser, "--position", "sensor's centre minus the specimen's, mm (default: the design's)")
 
 
 def _add_depths(place: Any) -> None:
@@ -170,6 +213,10 @@ def _add_run_flags(parser: Parser, out: str | None = None) -> None:
     default = "" if out is None else f" (default {out})"
     parser.add_argument("--out", metavar="DIR", default=out, help="new folder for the results" + default)
     _add_quality_flag(parser, "; reference traces paths from the camera: hours")
+    _add_light_flags(parser)
+
+
+def _add_light_flags(parser: Parser) -> None:
     parser.add_argument(
         "--seed", type=whole, default=0, metavar="N", help="of all random numbers (default 0)"
     )

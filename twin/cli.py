@@ -1,4 +1,4 @@
-"""The command line: ``twin demo``, ``twin simulate``, ``twin export``, ``twin schema``.
+"""The command line: ``twin demo``, ``simulate``, ``check``, ``export``, ``schema``.
 
 Exit status 0: done; 1: the machine failed (a full disk); 2: bad input, one line on stderr; 130: interrupted.
 Nothing slow is imported until the input has been checked.
@@ -11,7 +11,8 @@ import json
 import os
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
@@ -47,6 +48,9 @@ _FLAGS = {
     "mechanics": "--mechanics",
     "vtu": "--vtu",
     "ccx": "--ccx",
+    "mitsuba": "--mitsuba",
+    "stl": "--stl",
+    "ply": "--ply",
     "out": "--out",
     "device": "--device",
 }
@@ -99,6 +103,8 @@ def _run(arguments: argparse.Namespace) -> int:
         design, inclusion = _pressed(arguments), _inclusion(arguments)
         levels = arguments.force or arguments.indentation or design.press.indentation_mm
         _simulate(arguments, design, inclusion, levels, by_force=bool(arguments.force))
+    elif arguments.verb == "check":
+        _check(arguments)
     elif arguments.verb == "export":
         _export(arguments, _pressed(arguments), _inclusion(arguments))
     else:
@@ -140,20 +146,78 @@ def _simulate(
     summarise(frames, Path(arguments.out))
 
 
+def _check(arguments: argparse.Namespace) -> None:
+    from twin import findings, prescription
+
+    try:
+        design = load_design(arguments.design).pressed(mechanics=arguments.mechanics)
+    except DesignError as error:
+        if not error.conflicts:
+            raise
+        # every value can be read, but some do not fit: that is what a doctor is for
+        found = findings.from_conflicts(error.conflicts)
+        prescription.show(None, found, str(arguments.design), as_json=arguments.json)
+        if arguments.out is not None:
+            with staged(arguments.out, prescription.holds_checkup) as place:
+                prescription.fill(None, found, str(arguments.design), place)
+        return
+    from twin import doctor
+
+    with ExitStack() as stack:
+        folder: Path | None = None
+        if arguments.out is not None:
+            folder = stack.enter_context(staged(arguments.out, prescription.holds_checkup))
+        tell = stack.enter_context(_telling())
+        checkup = doctor.check_up(
+            design,
+            arguments.indentation,
+            seed=arguments.seed,
+            device=arguments.device,
+            progress=lambda stage, done: tell(stage, _SIMULATION_SHARE * done),
+        )
+        found = findings.findings(checkup)
+        if folder is not None:
+            tell("files", 1.0)
+            prescription.fill(checkup, found, design.name, folder)
+        interrupt.stop_if_asked()
+    prescription.show(checkup, found, design.name, as_json=arguments.json)
+    if arguments.out is not None and not arguments.json:
+        print(f"look at: {Path(arguments.out) / prescription.PICTURE}")
+
+
 def _export(arguments: argparse.Namespace, design: Design, inclusion: fem.Inclusion | None) -> None:
-    from twin import export
+    from twin import export, export_optics
 
     if arguments.ccx is not None:
         levels = arguments.indentation or design.press.indentation_mm
         folder = export.export_decks(design, inclusion, levels, arguments.ccx, quality=arguments.quality)
         print(f"folder: {folder} (README.txt says how to run the decks)")
         return
-    if arguments.vtu is None:
-        raise DesignError("--vtu, --ccx", "nothing", "one of them, with what to write")
-    kind: export.Kind = "vtu"
-    name = arguments.vtu
     levels = arguments.indentation or design.press.indentation_mm
-    export.check(design, inclusion, levels, kind, name)
+    for kind in export_optics.KINDS:
+        if (name := getattr(arguments, kind)) is not None:
+            export_optics.check(design, inclusion, levels)
+            with _telling() as tell:
+                place = export_optics.export(
+                    design, inclusion, levels, kind, name, quality=arguments.quality, progress=tell
+                )
+            print(f"folder: {place} (README.txt says what is in it)")
+            return
+    if arguments.vtu is None:
+        flags = "--vtu, --ccx, --mitsuba, --stl, --ply"
+        raise DesignError(flags, "nothing", "one of them, with what to write")
+    name = arguments.vtu
+    export.check(design, inclusion, levels, "vtu", name)
+    with _telling() as tell:
+        target = export.export(
+            design, inclusion, levels, "vtu", name, quality=arguments.quality, progress=tell
+        )
+    print(f"file: {target}")
+
+
+@contextmanager
+def _telling() -> Iterator[Callable[[str, float], None]]:
+    """A progress bar that also hears Ctrl-C."""
     from twin.reporting import Reporter
 
     with Reporter() as report:
@@ -162,10 +226,7 @@ def _export(arguments: argparse.Namespace, design: Design, inclusion: fem.Inclus
             interrupt.stop_if_asked()
             report(stage, done)
 
-        target = export.export(
-            design, inclusion, levels, kind, name, quality=arguments.quality, progress=tell
-        )
-    print(f"file: {target}")
+        yield tell
 
 
 def _pressed(arguments: argparse.Namespace) -> Design:

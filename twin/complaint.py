@@ -30,10 +30,21 @@ class DesignError(ValueError):
     """A value that cannot be: of a design, an inclusion or a press. Its text is one line.
 
     ``field`` is the dotted name, ``received`` the value as text, ``allowed`` what would do, ``source`` the
-    file (or "") and ``more`` how many other mistakes were found beside this one.
+    file (or "") and ``more`` how many other mistakes were found beside this one. ``conflicts`` holds them all
+    where every value alone can be read, but some do not fit the others.
     """
 
-    def __init__(self, field: str, received: str, allowed: str, *, source: str = "", more: int = 0) -> None:
+    def __init__(
+        self,
+        field: str,
+        received: str,
+        allowed: str,
+        *,
+        source: str = "",
+        more: int = 0,
+        conflicts: Sequence[DesignError] = (),
+    ) -> None:
+        self.conflicts = tuple(conflicts)
         self.field, self.received, self.allowed, self.source, self.more = (
             field,
             received,
@@ -53,6 +64,7 @@ class DesignError(ValueError):
             self.allowed,
             source=self.source if source is None else source,
             more=self.more,
+            conflicts=self.conflicts,
         )
 
 
@@ -70,7 +82,8 @@ def from_validation(error: ValidationError, data: object, schema: Mapping[str, A
     first, more = errors[0], len(errors) - 1
     cause = first.get("ctx", {}).get("error")
     if isinstance(cause, DesignError):
-        return DesignError(cause.field, cause.received, cause.allowed, more=cause.more + more)
+        more += cause.more
+        return DesignError(cause.field, cause.received, cause.allowed, more=more, conflicts=cause.conflicts)
     field, received, allowed = _words(first, data, schema)
     return DesignError(field, received, allowed, more=more)
 
@@ -133,22 +146,24 @@ def _node(schema: Mapping[str, Any], location: Location) -> Mapping[str, Any]:
 
 
 def _resolved(schema: Mapping[str, Any], node: Mapping[str, Any] | None) -> Mapping[str, Any]:
-    while node is not None and "$ref" in node:
-        node = schema["$defs"][node["$ref"].rsplit("/", 1)[-1]]
+    while node is not None and ("$ref" in node or "anyOf" in node):
+        if "$ref" in node:
+            node = schema["$defs"][node["$ref"].rsplit("/", 1)[-1]]
+        else:  # a value that may be left out
+            node = next((kind for kind in node["anyOf"] if kind.get("type") != "null"), None)
     return node or {}
 
 
 def _of_kind(schema: Mapping[str, Any], node: Mapping[str, Any] | None, kind: str) -> Mapping[str, Any]:
     """The node, or of several kinds of value that it allows the one of this type."""
     node = _resolved(schema, node)
-    choices = [_resolved(schema, choice) for choice in node.get("oneOf", node.get("anyOf", []))]
+    choices = [_resolved(schema, choice) for choice in node.get("oneOf", [])]
     return next((choice for choice in choices if choice.get("type") == kind), node)
 
 
 def _child(
     schema: Mapping[str, Any], node: Mapping[str, Any] | None, step: str | int
 ) -> Mapping[str, Any] | None:
-    node = _resolved(schema, node)
     node = _of_kind(schema, node, "array" if isinstance(step, int) else "object")
     if isinstance(step, int):
         fixed = node.get("prefixItems", [])
@@ -161,9 +176,8 @@ _BOUNDS = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "m
 
 def _in_words(schema: Mapping[str, Any], node: Mapping[str, Any] | None) -> str:
     node = _resolved(schema, node)
-    kinds = [kind for kind in node.get("anyOf", node.get("oneOf", [])) if kind.get("type") != "null"]
-    if kinds:  # a value that may be left out, or be of several kinds
-        return " or ".join(_in_words(schema, kind) for kind in kinds)
+    if "oneOf" in node:  # a value of several kinds
+        return " or ".join(_in_words(schema, kind) for kind in node["oneOf"])
     if "enum" in node:
         return "one of " + ", ".join(repr(choice) for choice in node["enum"])
     match node.get("type"):

@@ -12,7 +12,6 @@ import tomllib
 from collections.abc import Iterable
 from dataclasses import replace
 from importlib.resources import files
-from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -22,22 +21,10 @@ from pydantic.json_schema import GenerateJsonSchema
 
 import fem
 from fem.model import DomeRadius, Length, Modulus, Offset, Poisson, Sides, Tilt
-from scenes import dispersion
-from scenes.quantity import Wavelength
-from scenes.sensor import (
-    Absorption,
-    Anisotropy,
-    Camera,
-    Glass,
-    Guide,
-    Led,
-    RefractiveIndex,
-    Scattering,
-    Sensor,
-    Skin,
-    Tissue,
-    Walls,
-)
+from scenes import dispersion, ies
+from scenes.led import Light
+from scenes.sensor import Camera, Glass, Guide, Led, Sensor, Walls
+from scenes.skin import Absorption, Anisotropy, RefractiveIndex, Scattering, Skin, Tissue
 from twin.complaint import DesignError, from_validation, not_finite, shown
 from twin.conflicts import design_conflicts, inclusion_conflicts
 
@@ -94,23 +81,6 @@ class Waveguide:
     def thickness_mm(self) -> float:
         """Thickness of all layers together, mm."""
         return sum(layer.thickness_mm for layer in self.layers)
-
-
-@dataclass(frozen=True, config=CONFIG)
-class Light:
-    """The light of the LEDs."""
-
-    wavelength_nm: Annotated[
-        Wavelength,
-        Field(
-            description="Wavelength of LEDs that are a line, nm. Light of other wavelengths is told as "
-            "radiance of this one that the camera would answer alike."
-        ),
-    ] = 550.0
-    bands: Annotated[
-        int,
-        Field(ge=1, le=64, description="Wavelengths that a spectrum is rendered at; a line takes one."),
-    ] = 3
 
 
 @dataclass(frozen=True, config=CONFIG)
@@ -209,7 +179,8 @@ class Design:
     def __post_init__(self) -> None:
         found = list(design_conflicts(self))
         if found:
-            raise DesignError(found[0].field, found[0].received, found[0].allowed, more=len(found) - 1)
+            first, more = found[0], len(found) - 1
+            raise DesignError(first.field, first.received, first.allowed, more=more, conflicts=found)
 
     def probe(self) -> fem.Probe:
         """Return the waveguide as the mechanics see it."""
@@ -365,7 +336,7 @@ def load_design(name_or_path: str | Path) -> Design:
     source = str(name_or_path)
     text = _read(name_or_path)
     try:
-        return parse_design(tomllib.loads(text), source)
+        return parse_design(ies.beside(tomllib.loads(text), _place(name_or_path).parent), source)
     except tomllib.TOMLDecodeError as error:
         message, _, place = str(error).rpartition(" (at ")
         raise DesignError(
@@ -397,15 +368,22 @@ def parse_design(data: dict[str, Any], source: str = "") -> Design:
         raise from_validation(error, data, schema).renamed(source=source) from None
 
 
+def _place(name_or_path: str | Path) -> Path:
+    """Return the file of a shipped design, or the path itself."""
+    source = str(name_or_path)
+    return (
+        Path(str(files("assets").joinpath("designs", f"{source}.toml")))
+        if source in shipped_designs()
+        else Path(source)
+    )
+
+
 def _read(name_or_path: str | Path) -> str:
     source = str(name_or_path)
     if not source:
         raise DesignError("DESIGN", "an empty name", "a shipped design or a TOML file")
-    place: Traversable | Path = Path(source)
-    if source in shipped_designs():
-        place = files("assets").joinpath("designs", f"{source}.toml")
     try:
-        return place.read_text(encoding="utf-8-sig")  # Windows editors put a mark first
+        return _place(name_or_path).read_text(encoding="utf-8-sig")  # Windows editors put a mark first
     except UnicodeDecodeError:
         raise DesignError("the file", "bytes that are not UTF-8 text", "a TOML file", source=source) from None
     except IsADirectoryError:

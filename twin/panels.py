@@ -224,6 +224,10 @@ def _led_marks(axes: Axes, frame: Pictured) -> None:
     left, right, low, high = _extent(frame)
     beyond, marks = False, []
     for led in frame.design.leds:
+        if led.side == "below":
+            place = np.clip(led.x_mm, left, right), np.clip(led.y_mm, low, high)
+            marks += axes.plot(*place, "o", ms=6, color=LED, mec=INK, mew=0.5, clip_on=False, zorder=5)
+            continue
         along, face = led.along_mm, frame.design.waveguide.width_mm / 2
         away = face + (led.gap_mm if led.coupling == "air" else -led.gap_mm)
         x, y, mark = {

@@ -244,7 +244,7 @@ def _frame(
             "tared": scalars(grey(image) - grey(reference), k),
             "seconds": time.perf_counter() - start,
             "noise_percent": lit.noise_percent,
-            "saturated_percent": _saturated_percent(design, image, received(lit)),
+            "saturated_percent": saturated_percent(design, image, received(lit)),
         },
     )
 
@@ -259,7 +259,7 @@ def _how(design: Design, press: Press) -> dict[str, Any]:
     }
 
 
-def _saturated_percent(design: Design, image: np.ndarray, radiance: np.ndarray) -> float:
+def saturated_percent(design: Design, image: np.ndarray, radiance: np.ndarray) -> float:
     """Return the share of pixels at the converter's last count or at the full well, per cent.
 
     ``image`` is (rows, columns[, 3]) counts, ``radiance`` the same of what the lens lets through, W m⁻² sr⁻¹.
