@@ -9,7 +9,7 @@ Import only after a variant is set (`scenes.backend.use`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from .build import led_frame
 from .irradiance import AngularBasis
+from .lamp import Patterns
 from .sensor import Sensor
 from .surface import OpticalSurface, heights
 
@@ -54,12 +55,20 @@ class _Path:
 def direct(sensor: Sensor, basis: AngularBasis, deformed: OpticalSurface) -> Array:
     """Weighted irradiance of the two families, (n_led, layers, CELLS, CELLS), W/mm².
 
-    From a Lambertian disc of flux F and area A in a medium of index m, the element dA sends F/(pi A m²) dA
+    From a disc of flux F and area A in a medium of index m, Lambertian or else with its pattern's factor
+    (`lamp.Patterns.relative`), the element dA sends F/(pi A m²) dA
     dp_y dp_z, so the irradiance at a target is that times |d(p_y, p_z)/d(x, y)|, the ray's two unknowns being
     found by Newton's method. Height and slope of the deformed surface at the target are kept; what the other
     LEDs' discs shade is left out.
     """
     n_led = len(sensor.leds)
+    here = [number for number, led in enumerate(sensor.leds) if led.side != "below" and led.flux_W > 0.0]
+    if len(here) < n_led:  # light from below crosses both faces at once: it is traced
+        found = np.zeros((n_led, basis.layers, CELLS, CELLS))
+        if here:
+            some = replace(sensor, leds=tuple(sensor.leds[number] for number in here))
+            found[here] = direct(some, basis, deformed)
+        return found
     half = sensor.guide.width_mm / 2
     middles = (np.arange(CELLS) + 0.5) / CELLS * 2 * half - half
     height = heights(deformed, middles)
@@ -110,6 +119,8 @@ def _disc_points() -> Array:
 class _Source:
     """The LED of each lane, in its own frame: axis into the guide, along its side, up."""
 
+    number: mi.UInt32
+    patterns: Patterns
     axis_x: mi.Float
     axis_y: mi.Float
     along: mi.Float
@@ -145,7 +156,8 @@ class _Source:
                     density,
                 ]
             )
-        return _Source(*(dr.gather(mi.Float, _float(column), led) for column in np.array(rows).T))
+        columns = (dr.gather(mi.Float, _float(column), led) for column in np.array(rows).T)
+        return _Source(led, Patterns(sensor.leds), *columns)
 
 
 def _first_guess(sensor: Sensor, source: _Source, here: list[mi.Float], by_glass: bool) -> mi.Vector2f:
@@ -230,6 +242,10 @@ def _arrives(
     facing = path.p_z - d_x * slope_x - d_y * slope_y
     cosine = facing * dr.rsqrt(1.0 + dr.square(slope_x) + dr.square(slope_y)) / n
     flux = source.density * path.etendue * share * facing / path.p_z
+    if not source.patterns.lambertian:
+        leaving = dr.sqrt(dr.maximum(1.0 - tangential2 / dr.square(source.index), 0.0))
+        rises = -path.p_z if by_glass else path.p_z
+        flux *= source.patterns.relative(source.number, leaving, path.p_y, rises)
     lit &= facing > 0.0
     found = dr.select(lit & dr.isfinite(slope.x + slope.y), slope, begin)
     arriving = tuple(dr.select(lit, value, 1.0) for value in (cosine, d_x, d_y))

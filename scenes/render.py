@@ -155,7 +155,7 @@ class Renderer:
         """Refuse LEDs that the deformed rim would shade: the gathered light knows no shade."""
         lowest = float((shape.rest_mm + shape.displacement_mm[..., 2]).min())
         for number, led in enumerate(self.sensor.leds):
-            if led.z_mm + led.diameter_mm / 2 > lowest:
+            if led.side != "below" and led.z_mm + led.diameter_mm / 2 > lowest:
                 allowed = (
                     f"at most {lowest - led.diameter_mm / 2:.3g} mm under this press, below the pressed rim"
                 )

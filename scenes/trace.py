@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from .bsdf import Table
 from .build import led_frame
 from .irradiance import AngularBasis, look_up
+from .lamp import Patterns
 from .sensor import Sensor
 from .tissue import Coupling
 
@@ -164,9 +165,9 @@ def walk(
 
 
 def emit(sensor: Sensor, number: mi.UInt32, u: list[mi.Float]) -> mi.Ray3f:
-    """Rays from the LEDs' discs, even over area, cosine-weighted over angle."""
-    half = sensor.guide.width_mm / 2
-    frames = np.array([np.concatenate(led_frame(led, half)) for led in sensor.leds])
+    """Rays from the LEDs' discs, even over area, over angle as their patterns say."""
+    half, floor = sensor.guide.width_mm / 2, -sensor.guide.thickness_mm - sensor.glass.thickness_mm
+    frames = np.array([np.concatenate(led_frame(led, half, floor)) for led in sensor.leds])
     radii = np.array([led.diameter_mm / 2 for led in sensor.leds])
     columns = [mi.Float(column.astype(np.float32)) for column in (*frames.T, radii)]
     centre, axis, tangent = (
@@ -174,7 +175,11 @@ def emit(sensor: Sensor, number: mi.UInt32, u: list[mi.Float]) -> mi.Ray3f:
     )
     radius = dr.gather(mi.Float, columns[9], number)
     on_disc = mi.warp.square_to_uniform_disk_concentric(mi.Point2f(u[0], u[1]))
-    direction = mi.warp.square_to_cosine_hemisphere(mi.Point2f(u[2], u[3]))
+    patterns = Patterns(sensor.leds)
+    direction = patterns.draw(number, mi.Point2f(u[2], u[3]))
+    if not patterns.lambertian:  # their y is the LED's upright, this frame's t that or its opposite
+        signs = [-1.0 if led.side in ("+x", "-y") else 1.0 for led in sensor.leds]
+        direction.y *= dr.gather(mi.Float, mi.Float(signs), number)
     frame = mi.Frame3f(tangent, dr.cross(axis, tangent), axis)
     origin = centre + radius * (on_disc.x * frame.s + on_disc.y * frame.t)
     away = frame.to_world(direction)
@@ -278,7 +283,7 @@ def _painted(sensor: Sensor, si: mi.SurfaceInteraction3f, on_wall: mi.Bool) -> m
         return mi.Bool(False)
     half, painted = sensor.guide.width_mm / 2, on_wall
     for led in sensor.leds:
-        if led.coupling == "air":
+        if led.coupling == "air" and led.side != "below":
             centre, axis, _ = led_frame(led, half)
             middle = mi.Point3f(*(centre + led.gap_mm * axis).tolist())
             painted = painted & (dr.squared_norm(si.p - middle) > led.window_mm**2)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from . import trace
 from .bsdf import Table
 from .irradiance import AngularBasis, smooth, transmitted
-from .sensor import Sensor
+from .sensor import Led, Sensor
 from .spread import Spread
 from .tissue import Coupling
 
@@ -118,7 +118,7 @@ def transport(
         place = index - number * dr.opaque(mi.UInt32, each)
         u = trace.evenly(place, starts[order])
         if upward is None:
-            legs = [trace.IN_AIR if led.coupling == "air" else trace.IN_GUIDE for led in sensor.leds]
+            legs = [_first_leg(led) for led in sensor.leds]
             leg = dr.gather(mi.UInt32, mi.UInt32(np.array(legs, dtype=np.uint32)), number)
             ray, amount, scale = trace.emit(sensor, number, u), dr.full(mi.Float, 1.0, n_led * each), flux
         else:
@@ -146,6 +146,13 @@ def transport(
         newest = _spread(basis, behind, ground, smooth(maps, GRID // trace.CELLS), width)
         total = total + newest
     return Light(total, sinks, trapped)
+
+
+def _first_leg(led: Led) -> int:
+    """Light from below belongs to no gathered family."""
+    if led.side == "below":
+        return trace.OTHER
+    return trace.IN_AIR if led.coupling == "air" else trace.IN_GUIDE
 
 
 def _spread(basis: AngularBasis, behind: Behind, ground: Ground, landed: Array, width_mm: float) -> Array:
