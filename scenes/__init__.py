@@ -16,6 +16,7 @@ from .skin import Sheet, Skin, Tissue
 
 if TYPE_CHECKING:
     from .render import Renderer, Rendering
+    from .spectral import SpectralRenderer
 
 __all__ = [
     "Camera",
@@ -27,6 +28,7 @@ __all__ = [
     "Sensor",
     "Sheet",
     "Skin",
+    "SpectralRenderer",
     "Tissue",
     "expose",
     "gap_transmittance",
@@ -40,4 +42,8 @@ def __getattr__(name: str) -> Any:
         from . import render
 
         return getattr(render, name)
+    if name == "SpectralRenderer":
+        from .spectral import SpectralRenderer
+
+        return SpectralRenderer
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

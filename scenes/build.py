@@ -18,7 +18,7 @@ from . import (
 )
 from .contact import ContactOptics, contact_optics, real_contact
 from .sensor import Led, Sensor
-from .tissue import body_behind
+from .tissue import Coupling, body_behind, couple
 
 _BLACK = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.0}}}
 _OUTWARD = {"+x": (1.0, 0.0), "-x": (-1.0, 0.0), "+y": (0.0, 1.0), "-y": (0.0, -1.0)}
@@ -38,6 +38,12 @@ def optics_of(sensor: Sensor) -> ContactOptics:
         sensor.wavelength_nm,
         dust=skin.dust,
     )
+
+
+def coupling_of(sensor: Sensor, optics: ContactOptics) -> Coupling:
+    """Tissue or sheet of this sensor behind its contact."""
+    index, body = body_behind(sensor.skin, sensor.tissue)
+    return couple(optics, body, sensor.guide.refractive_index, index)
 
 
 def load_scene(sensor: Sensor, table: mi.TensorXf) -> mi.Scene:
@@ -69,7 +75,7 @@ def describe(sensor: Sensor, contact: mi.Mesh | dict[str, Any]) -> dict[str, Any
         scene[f"wall_{side}"] = _wall(half, bottom, _WALL_TOP_MM, outward, side_wall)
         scene[f"rim_{side}"] = _wall(half, lowest, bottom, outward, _BLACK)
     for number, led in enumerate(sensor.leds):
-        scene[f"led_{number}"] = _led(led, half)
+        scene[f"led_{number}"] = _led(led, half, lowest)
     return scene
 
 
@@ -108,8 +114,17 @@ def light_only(scene: mi.Scene, sensor: Sensor, number: int | None) -> None:
     parameters.update()
 
 
-def led_frame(led: Led, half_mm: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Centre (3,) mm of an LED's disc, its unit axis (3,) into the guide, and a unit tangent (3,)."""
+def led_frame(
+    led: Led, half_mm: float, floor_mm: float | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Centre (3,) mm of an LED's disc, its unit axis (3,) into the guide, and a unit tangent (3,).
+
+    LEDs below need `floor_mm`, the height of the glass's lower face.
+    """
+    if led.side == "below":
+        assert floor_mm is not None
+        height = floor_mm + (-led.gap_mm if led.coupling == "air" else led.gap_mm)
+        return np.array([led.x_mm, led.y_mm, height]), np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
     outward = np.array([*_OUTWARD[led.side], 0.0])
     tangent = np.array([abs(outward[1]), abs(outward[0]), 0.0])  # along the side, in +x or +y
     away = led.gap_mm if led.coupling == "air" else -led.gap_mm
@@ -169,11 +184,10 @@ def _wall(
     return {"type": "rectangle", "to_world": look.scale([half, 0.5 * (high - low), 1]), "bsdf": material}
 
 
-def _led(led: Led, half: float) -> dict[str, Any]:
-    centre, axis, _ = led_frame(led, half)
-    place = mi.ScalarTransform4f().look_at(
-        origin=centre.tolist(), target=(centre + axis).tolist(), up=[0, 0, 1]
-    )
+def _led(led: Led, half: float, floor: float) -> dict[str, Any]:
+    centre, axis, _ = led_frame(led, half, floor)
+    up = [0, 1, 0] if led.side == "below" else [0, 0, 1]
+    place = mi.ScalarTransform4f().look_at(origin=centre.tolist(), target=(centre + axis).tolist(), up=up)
     return {
         "type": "disk",
         "to_world": place.scale(led.diameter_mm / 2),
@@ -183,5 +197,5 @@ def _led(led: Led, half: float) -> dict[str, Any]:
 
 
 def radiance(led: Led) -> float:
-    """Radiance of an LED's Lambertian disc, W / (mm² sr)."""
+    """Radiance of an LED's disc, W / (mm² sr), if it is Lambertian; else times `lamp.Patterns.relative`."""
     return float(led.flux_W / (dr.pi * (dr.pi * led.diameter_mm**2 / 4)))

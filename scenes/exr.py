@@ -21,6 +21,8 @@ import OpenEXR
 from numpy.typing import NDArray
 from PIL import Image
 
+from . import png
+
 StrPath = str | os.PathLike[str]
 
 # Attributes that describe the pixels themselves (OpenEXR technical introduction, "required attributes").
@@ -93,25 +95,35 @@ def read_exr_header(path: StrPath) -> dict[str, str]:
 
 
 def write_png(path: StrPath, image: NDArray[Any]) -> None:
-    """Write counts, (rows, columns) uint8 or uint16, as a grey PNG of 8 or 16 bits."""
+    """Write counts, (rows, columns) or (rows, columns, 3), uint8 or uint16, as a PNG, grey or RGB."""
     array = np.asarray(image)
-    if array.dtype not in (np.uint8, np.uint16) or array.ndim != 2 or array.size == 0:
+    fits = array.ndim == 2 or (array.ndim == 3 and array.shape[2] == 3)
+    if array.dtype not in (np.uint8, np.uint16) or not fits or array.size == 0:
         raise ImageError(
-            f"{path}: image: received {array.dtype} {array.shape}, allowed: uint8 or uint16, (rows, columns)"
+            f"{path}: image: received {array.dtype} {array.shape}, allowed: uint8 or uint16, "
+            "(rows, columns) or (rows, columns, 3)"
         )
+    if array.ndim == 3 and array.dtype == np.uint16:
+        write_bytes(path, png.encode(array))
+        return
     stream = io.BytesIO()
     Image.fromarray(np.ascontiguousarray(array)).save(stream, format="PNG", compress_level=6)
     write_bytes(path, stream.getvalue())
 
 
 def read_png(path: StrPath) -> NDArray[Any]:
-    """Counts of a grey PNG, (rows, columns) uint8 or uint16.
+    """Counts of a PNG, (rows, columns) or (rows, columns, 3), uint8 or uint16.
 
-    Raises ImageError, in one line, for a file that is missing, cut short, not PNG or not grey.
+    Raises ImageError, in one line, for a file that is missing, cut short, not PNG, or neither grey nor RGB.
     """
     data = _read(Path(path))
     if not data.startswith(b"\x89PNG\r\n\x1a\n"):
         raise ImageError(f"{path}: not a PNG file")
+    if png.is_deep_colour(data):
+        try:
+            return png.decode(data)
+        except ValueError as error:
+            raise ImageError(f"{path}: {error}") from error
     try:
         with Image.open(io.BytesIO(data), formats=["PNG"]) as picture:
             picture.load()
@@ -119,11 +131,11 @@ def read_png(path: StrPath) -> NDArray[Any]:
     # Pillow reports damage as SyntaxError, struct.error or OSError, depending on which chunk it hits.
     except (OSError, SyntaxError, ValueError, struct.error, Image.DecompressionBombError) as error:
         raise ImageError(f"{path}: damaged PNG file") from error
-    if mode == "L":
+    if mode in ("L", "RGB"):
         return array.astype(np.uint8)
     if mode in ("I;16", "I;16B", "I"):
         return array.astype(np.uint16)
-    raise ImageError(f"{path}: received a PNG of mode {mode}, allowed: grey of 8 or 16 bits")
+    raise ImageError(f"{path}: received a PNG of mode {mode}, allowed: grey or RGB of 8 or 16 bits")
 
 
 def write_bytes(path: StrPath, data: bytes) -> None:

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .bsdf import Table
-from .build import radiance
+from .build import led_frame, radiance
 from .irradiance import look_up
+from .lamp import Patterns
 from .sensor import Sensor
 from .tissue import Coupling
 from .view import PixelRays, faces_reflectance
@@ -60,13 +61,13 @@ def look(scene: mi.Scene, sensor: Sensor, table: Table, coupling: Coupling, rays
     named = {shape.id(): mi.ShapePtr(shape) for shape in scene.shapes()}
     # the run in the glass and back, near the axis, as one in the guide
     in_glass = 2.0 * sensor.glass.thickness_mm * guide.refractive_index / sensor.glass.refractive_index
-    lamps = [mi.Float(0.0) for _ in sensor.leds]
+    lamps, patterns = [mi.Float(0.0) for _ in sensor.leds], Patterns(sensor.leds)
     points, windows = [], []
     start = mi.Point3f(*origin) + _STEP_MM / direction.z * direction
     for _ in range(_SIGHTS):
         si = _meet(scene, named["contact"], start, direction)
         seen = si.is_valid() & (si.shape == named["contact"])
-        _add_lamps(lamps, si, gain, sensor, named)
+        _add_lamps(lamps, si, gain, sensor, named, patterns)
         windows.append(gain)
         cosine = mi.Frame3f.cos_theta(si.wi)
         fraction = dr.select(seen, contact.eval_attribute_1("vertex_contact_fraction", si, seen), 0.0)
@@ -78,7 +79,9 @@ def look(scene: mi.Scene, sensor: Sensor, table: Table, coupling: Coupling, rays
         gain = dr.select(seen, gain * (1.0 - transmitted), 0.0)
         down = mi.Vector3f(direction.x, direction.y, -direction.z)
         below = scene.ray_intersect(mi.Ray3f(si.p + _STEP_MM * down, down), seen)
-        _add_lamps(lamps, below, gain, sensor, named)
+        _add_lamps(lamps, below, gain, sensor, named, patterns)
+        through = below.is_valid() & (below.shape == named["guide_to_glass"])
+        _add_lamps_below(lamps, si.p, down, dr.select(through, gain, 0.0), sensor, patterns)
         gain = dr.select(below.shape == named["guide_to_glass"], gain * mirrored, 0.0)
         run = (si.p.z + guide.thickness_mm + in_glass) / direction.z
         start = mi.Point3f(si.p.x, si.p.y, -guide.thickness_mm) + mi.Vector3f(
@@ -110,12 +113,69 @@ def _add_lamps(
     gain: mi.Float,
     sensor: Sensor,
     named: dict[str, mi.ShapePtr],
+    patterns: Patterns,
 ) -> None:
     """Add the radiance at the camera of the LEDs whose front these rays meet."""
     front = si.is_valid() & (mi.Frame3f.cos_theta(si.wi) > 0.0)
     for number, led in enumerate(sensor.leds):
+        if led.side == "below":
+            continue
         meets = front & (si.shape == named[f"led_{number}"])
-        lamps[number] += dr.select(meets, gain * radiance(led), 0.0)
+        _, axis, tangent = led_frame(led, sensor.guide.width_mm / 2)
+        towards = si.to_world(si.wi)
+        ahead, along = (dr.dot(towards, mi.Vector3f(*line.tolist())) for line in (axis, tangent))
+        leaves = patterns.relative(mi.UInt32(number), ahead, along, towards.z)
+        lamps[number] += dr.select(meets, gain * radiance(led) * leaves, 0.0)
+
+
+def _add_lamps_below(
+    lamps: list[mi.Float],
+    point: mi.Point3f,
+    down: mi.Vector3f,
+    gain: mi.Float,
+    sensor: Sensor,
+    patterns: Patterns,
+) -> None:
+    """Add what rays that go down from a point in the guide meet of the LEDs below, through flat faces.
+
+    Reflections between the faces and the discs are left out.
+    """
+    guide, glass = sensor.guide, sensor.glass
+    n1, n2 = guide.refractive_index, glass.refractive_index
+    px, py = n1 * down.x, n1 * down.y
+    square = dr.square(px) + dr.square(py)
+
+    def per_index(index: float) -> mi.Float:
+        return dr.rsqrt(dr.maximum(index**2 - square, 1e-6))
+
+    run = (point.z + guide.thickness_mm) * per_index(n1)
+    for number, led in enumerate(sensor.leds):
+        if led.side != "below":
+            continue
+        in_air = led.coupling == "air"
+        through = run + (glass.thickness_mm - (0.0 if in_air else led.gap_mm)) * per_index(n2)
+        medium = 1.0 if in_air else n2
+        if in_air:
+            through += led.gap_mm * per_index(1.0)
+        off_x, off_y = point.x + through * px - led.x_mm, point.y + through * py - led.y_mm
+        meets = (dr.square(off_x) + dr.square(off_y) < (led.diameter_mm / 2) ** 2) & (square < medium**2)
+        lost = _fresnel(n1, n2, square)
+        if in_air:
+            second = _fresnel(n2, 1.0, square)
+            lost = lost + dr.square(1.0 - lost) * second / dr.maximum(1.0 - lost * second, 1e-6)
+        cosine = dr.sqrt(dr.maximum(1.0 - square / medium**2, 0.0))
+        leaves = patterns.relative(mi.UInt32(number), cosine, -px, -py)
+        seen = gain * (1.0 - lost) * (n1 / medium) ** 2 * radiance(led) * leaves
+        lamps[number] += dr.select(meets, seen, 0.0)
+
+
+def _fresnel(n_in: float, n_out: float, square: mi.Float) -> mi.Float:
+    """Unpolarised reflectance at a squared tangential index (Born & Wolf 1999; key born1999)."""
+    a = dr.sqrt(dr.maximum(n_in**2 - square, 0.0))
+    b = dr.sqrt(dr.maximum(n_out**2 - square, 0.0))
+    s = (a - b) / dr.maximum(a + b, 1e-9)
+    p = (n_out**2 * a - n_in**2 * b) / dr.maximum(n_out**2 * a + n_in**2 * b, 1e-9)
+    return dr.select(square < n_out**2, 0.5 * (dr.square(s) + dr.square(p)), 1.0)
 
 
 def picture(sight: Sight, upward: NDArray[np.float64]) -> NDArray[np.float32]:

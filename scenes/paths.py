@@ -195,7 +195,7 @@ def _step(  # type: ignore[no-untyped-def]
     )
     direction = dr.select(on_contact, mi.reflect(si.wi), direction)
     stops = elsewhere & (random.next_float32() >= kept)
-    end(stops & trace._one_of(si.shape, shapes, "led_"), "leds")
+    end(stops & trace.one_of(si.shape, shapes, "led_"), "leds")
     end(stops & on_wall, "walls")
     end(stops, "frame")
 

@@ -14,7 +14,7 @@ from .view import tangent_scale
 
 class Pinhole(mi.Sensor):
     """A pinhole at `origin` looking up (+z); the film spans the tangents ±`reach` (x, y), columns with +x,
-    rows with -y.
+    rows with -y; its tangents are distorted by `distortion` (k1, k2), as in `view`.
 
     Mitsuba's own `perspective` knows square pixels only. Rays carry weight 1: the film holds radiance.
     """
@@ -24,6 +24,8 @@ class Pinhole(mi.Sensor):
         self.m_origin = mi.ScalarPoint3f(props["origin"])
         reach = mi.ScalarPoint3f(props["reach"])
         self.m_reach_x, self.m_reach_y = reach.x, reach.y
+        bend = mi.ScalarPoint3f(props.get("distortion", mi.ScalarPoint3f(0.0)))
+        self.m_k1, self.m_k2 = bend.x, bend.y
 
     def sample_ray(
         self,
@@ -35,9 +37,22 @@ class Pinhole(mi.Sensor):
     ) -> tuple[mi.Ray3f, mi.Color1f]:
         tangent_x = (2.0 * sample2.x - 1.0) * self.m_reach_x
         tangent_y = (1.0 - 2.0 * sample2.y) * self.m_reach_y
+        if self.m_k1 or self.m_k2:
+            shrink = self._undistort(dr.sqrt(dr.square(tangent_x) + dr.square(tangent_y)))
+            tangent_x, tangent_y = tangent_x * shrink, tangent_y * shrink
         ray = mi.Ray3f(mi.Point3f(self.m_origin), dr.normalize(mi.Vector3f(tangent_x, tangent_y, 1.0)))
         ray.time = time
         return ray, mi.Color1f(1.0)
+
+    def _undistort(self, distorted: mi.Float) -> mi.Float:
+        """r/d(r) for given d, by Newton's method, which converges since d rises beyond the corners."""
+        tangent = mi.Float(distorted)
+        for _ in range(10):
+            square = dr.square(tangent)
+            miss = tangent * (1.0 + square * (self.m_k1 + square * self.m_k2)) - distorted
+            slope = 1.0 + square * (3.0 * self.m_k1 + 5.0 * square * self.m_k2)
+            tangent = tangent - miss / dr.maximum(slope, 0.05)
+        return dr.select(distorted > 1e-9, tangent / dr.maximum(distorted, 1e-9), 1.0)
 
     def sample_ray_differential(
         self,
@@ -70,10 +85,11 @@ def describe(sensor: Sensor) -> dict[str, object]:
         "type": "tsis_pinhole",
         "origin": mi.ScalarPoint3f(0.0, 0.0, height),
         "reach": mi.ScalarPoint3f(reach_x, reach_y, 0.0),
+        "distortion": mi.ScalarPoint3f(*camera.distortion, 0.0),
         "film": {
             "type": "hdrfilm",
-            "width": camera.columns,
-            "height": camera.rows,
+            "width": camera.shape[1],
+            "height": camera.shape[0],
             "rfilter": {"type": "box"},
             "pixel_format": "luminance",
         },

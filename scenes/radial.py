@@ -17,7 +17,7 @@ from scipy.special import j0, j1, k0e, k1e
 Array = NDArray[np.float64]
 
 _TERMS = 110
-_TOP = 500.0  # of k: beyond, the transform is its tail
+_TOP = 500.0  # of k/b: beyond, the transform is its tail
 _CUT = 60.0  # of k r, where the taper takes hold
 _NEAR_CELLS = 12  # within this many cells a kernel is spread by rings, beyond by its values
 
@@ -39,7 +39,7 @@ class Kernel:
     scale
         Wave number s of the variable asinh(k/s) of the series: where R^ starts to bend.
     series
-        Coefficients of the rest in T_n(2 (asinh(k/s)/asinh(_TOP/s))² - 1).
+        Coefficients of the rest in T_n(2 (asinh(k/s)/asinh(top/s))² - 1), where top is 500 b.
     """
 
     total: float
@@ -49,7 +49,7 @@ class Kernel:
 
     def rest(self, k: Array) -> Array:
         """The transform less its tail, same shape as k >= 0."""
-        y = np.arcsinh(k / self.scale) / np.arcsinh(_TOP / self.scale)
+        y = np.arcsinh(k / self.scale) / np.arcsinh(_TOP * self.tail[2] / self.scale)
         inside = y <= 1.0
         return np.asarray(
             np.where(inside, chebyshev.chebval(2.0 * np.minimum(y, 1.0) ** 2 - 1.0, self.series), 0.0)
@@ -144,11 +144,11 @@ def kernel(hat: Callable[[Array], Array], first: float, scale: float, decay: flo
     decay
         b of the tail's parts: about where R^ gets to its tail.
     """
-    scale = max(scale, 1e-4)
+    scale, top = max(scale, 1e-4), _TOP * decay
     y = np.cos(np.pi * (np.arange(_TERMS) + 0.5) / _TERMS)
-    k = scale * np.sinh(np.sqrt(0.5 * (1.0 + y)) * np.arcsinh(_TOP / scale))
-    values = hat(np.concatenate([[0.0, 0.5 * _TOP], k]))
-    middle = 0.5 * _TOP
+    k = scale * np.sinh(np.sqrt(0.5 * (1.0 + y)) * np.arcsinh(top / scale))
+    values = hat(np.concatenate([[0.0, 0.5 * top], k]))
+    middle = 0.5 * top
     second = (values[1] - first / np.hypot(middle, decay)) * (middle**2 + decay**2)
     rest = values[2:] - first / np.sqrt(k**2 + decay**2) - second / (k**2 + decay**2)
     series = chebyshev.chebfit(y, rest, _TERMS - 1)

@@ -50,8 +50,8 @@ def path_trace(
         Radiance (rows, columns) in W m⁻² sr⁻¹ and the standard error of each pixel's mean. Sums run in a
         fixed order: the bytes do not depend on the number of threads.
     """
-    camera = sensor.camera
-    top, end_row, left, end_column = crop or (0, camera.rows, 0, camera.columns)
+    film_rows, film_columns = sensor.camera.shape
+    top, end_row, left, end_column = crop or (0, film_rows, 0, film_columns)
     rows, columns = end_row - top, end_column - left
     pixels = rows * columns
     integrator = mi.load_dict({"type": "path", "max_depth": MAX_DEPTH, "rr_depth": ROULETTE_DEPTH})
@@ -66,7 +66,7 @@ def path_trace(
         pixel = dr.arange(mi.UInt32, pixels * per_pass) // per_pass
         jitter = sampler.next_2d()
         column, row = mi.Float(pixel % columns) + left, mi.Float(pixel // columns) + top
-        film = mi.Point2f((column + jitter.x) / camera.columns, (row + jitter.y) / camera.rows)
+        film = mi.Point2f((column + jitter.x) / film_columns, (row + jitter.y) / film_rows)
         ray, _ = eye.sample_ray(mi.Float(0.0), mi.Float(0.0), film, mi.Point2f(0.0))
         radiance = integrator.sample(scene, sampler, mi.RayDifferential3f(ray))[0][0]
         total += dr.block_sum(radiance, per_pass).numpy()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -20,16 +20,15 @@ if TYPE_CHECKING:
     from .gather import Sight
     from .transport import Light
 
+Array = NDArray[np.float64]
 Quality = Literal["preview", "standard", "reference"]
 
-PATHS_PER_LED = {"preview": 2**17, "standard": 2**22}
-"""Light paths that the qualities spend on each LED; "reference" has its own."""
+PATHS_PER_LED = {"preview": 2**17, "standard": 2**20, "reference": 2**24}
+"""Light paths that the qualities spend on each LED."""
 
-_PATHS_PER_PASS = 2**20  # independent passes bound the memory and tell the noise
-_MOST_PASSES = 4096  # so that seeds of passes do not meet
-
-REFERENCE_SAMPLES = 2**24
-"""Light paths per LED of a reference picture."""
+_PATHS_PER_PASS = 2**20  # of all LEDs; independent passes bound the memory and tell the noise
+_LEAST_PASSES = 2
+_MOST_PASSES = 2**14  # so that seeds of passes do not meet
 
 
 @dataclass(frozen=True)
@@ -46,7 +45,7 @@ class Rendering:
         Contact pressure, kPa, and displacement, mm (+z into the specimen), at that point.
     noise_percent : float
         Standard error of the radiance of all LEDs together from Monte Carlo: root mean square over pixels, in
-        per cent of the mean; from the spread of independent passes (traced) or of the samples (reference).
+        per cent of the mean; from the spread of independent passes.
     seconds : float
         Wall-clock time.
     sinks, trapped : (n_led, len(trace.SINKS)) and (n_led,), or None
@@ -60,8 +59,8 @@ class Rendering:
     displacement_z: NDArray[np.float32]
     noise_percent: float
     seconds: float
-    sinks: NDArray[np.float64] | None = None
-    trapped: NDArray[np.float64] | None = None
+    sinks: Array | None = None
+    trapped: Array | None = None
 
 
 class Renderer:
@@ -77,13 +76,12 @@ class Renderer:
 
         self.sensor = sensor
         self.rays = view.pixel_rays(sensor)
-        guide = sensor.guide
         with threadpool_limits(1):  # linear algebra on several threads sums in another order
             optics = build.optics_of(sensor)
-            index, body = tissue.body_behind(sensor.skin, sensor.tissue)
-            coupling = tissue.couple(optics, body, guide.refractive_index, index)
-            spreads = spread.spreader(body, coupling, guide.width_mm, transport.GRID)
-            self.basis = angular_basis(optics, coupling.lobes)
+            coupling = build.coupling_of(sensor, optics)
+            _, body = tissue.body_behind(sensor.skin, sensor.tissue)
+            spreads = spread.spreader(body, coupling, sensor.guide.width_mm, transport.GRID)
+            self.basis = angular_basis(optics, coupling)
         self.behind = transport.Behind(coupling, spreads)
         self.packed = Table.pack(optics, coupling)
         self.table = Table(self.packed)
@@ -97,6 +95,7 @@ class Renderer:
         quality: Quality = "standard",
         seed: int = 0,
         samples: int | None = None,
+        noise: float | None = None,
         progress: Callable[[float], None] | None = None,
     ) -> Rendering:
         """Return the radiance picture of a pressed contact surface.
@@ -114,33 +113,39 @@ class Renderer:
             Seed of the light. The same seed gives the same bytes, whatever the number of threads.
         samples
             Light paths per LED, instead of the quality's own number.
+        noise
+            Go on, pass by pass, until `noise_percent` is at most this.
         progress
             Called with the finished share, 0 to 1.
         """
-        if quality not in (*PATHS_PER_LED, "reference"):
+        if quality not in PATHS_PER_LED:
             raise ValueError(f"quality: received {quality!r}; allowed: 'preview', 'standard', 'reference'")
+        if noise is not None and not noise > 0.0:
+            raise ValueError(f"noise: received {noise:g} %; allowed: more than 0")
         from . import build, gather
 
         start = time.perf_counter()
-        tell = progress or (lambda done: None)
         shape = surface.resample(pressed, self.sensor.guide.width_mm, suffix=field.removeprefix("pressure"))
         build.put_surface(self.scene, self.sensor, shape)
         sight = gather.look(self.scene, self.sensor, self.table, self.behind.coupling, self.rays)
+        samples = samples or PATHS_PER_LED[quality]
+        each = max(_PATHS_PER_PASS // len(self.sensor.leds), 1)
+        passes = max(_LEAST_PASSES, -(-samples // each))
         lights: list[Light] = []
         if quality == "reference":
-            radiance, noise = self._reference(sight, samples or REFERENCE_SAMPLES, seed, tell)
+            pictures = self._followed(sight, -(-samples // passes), seed)
         else:
             self._check_leds(shape)
-            radiance, noise = self._traced(
-                shape, sight, samples or PATHS_PER_LED[quality], seed, tell, lights
-            )
+            pictures = self._gathered(shape, sight, max(samples // passes, 2), seed, lights)
+        radiance, found = _averaged(pictures, passes, noise, progress or (lambda done: None))
         pressure, displacement_z = surface.at(shape, sight.position_mm)
         return Rendering(
-            radiance,
+            # the smoothing kernel has negative sides: next to an edge of light they may undershoot the dark
+            np.maximum(radiance, 0.0).astype(np.float32),
             sight.position_mm,
             pressure,
             displacement_z,
-            noise,
+            found,
             time.perf_counter() - start,
             np.mean([light.sinks for light in lights], axis=0) if lights else None,
             np.mean([light.trapped for light in lights], axis=0) if lights else None,
@@ -150,77 +155,55 @@ class Renderer:
         """Refuse LEDs that the deformed rim would shade: the gathered light knows no shade."""
         lowest = float((shape.rest_mm + shape.displacement_mm[..., 2]).min())
         for number, led in enumerate(self.sensor.leds):
-            if led.z_mm + led.diameter_mm / 2 > lowest:
+            if led.side != "below" and led.z_mm + led.diameter_mm / 2 > lowest:
                 allowed = (
                     f"at most {lowest - led.diameter_mm / 2:.3g} mm under this press, below the pressed rim"
                 )
                 raise NotModelled(f"leds.{number}.z_mm: received {led.z_mm:g}; allowed {allowed}")
 
-    def _traced(
-        self,
-        shape: surface.OpticalSurface,
-        sight: Sight,
-        samples: int,
-        seed: int,
-        tell: Callable[[float], None],
-        lights: list[Light],
-    ) -> tuple[NDArray[np.float32], float]:
-        """Radiance and its noise; `lights` takes what each pass found."""
+    def _gathered(
+        self, shape: surface.OpticalSurface, sight: Sight, samples: int, seed: int, lights: list[Light]
+    ) -> Iterator[NDArray[np.floating]]:
+        """Pictures (n_led, rows, columns) of independent passes; `lights` takes what each found."""
         from . import direct, gather, transport
 
         straight = direct.direct(self.sensor, self.basis, shape)
         ground = transport.survey(self.scene, self.sensor)
-        passes = max(2, -(-samples // _PATHS_PER_PASS))
-        runs = []
-        for number in range(passes):
+        parts = (self.scene, self.sensor, self.table, self.basis, self.behind, ground, straight, samples)
+        for number in range(_MOST_PASSES):
             with threadpool_limits(1):
-                light = transport.transport(
-                    self.scene,
-                    self.sensor,
-                    self.table,
-                    self.basis,
-                    self.behind,
-                    ground,
-                    straight,
-                    max(samples // passes, 2),
-                    seed * _MOST_PASSES + number,
-                )
+                light = transport.transport(*parts, seed * _MOST_PASSES + number)
             lights.append(light)
-            runs.append(gather.picture(sight, light.upward))
-            tell((number + 1) / passes)
-        # the smoothing kernel has negative sides: next to an edge of light they may undershoot the dark
-        radiance = np.maximum(np.mean(runs, axis=0, dtype=np.float64), 0.0)
-        totals = np.sum(runs, axis=1, dtype=np.float64)
-        spread = np.std(totals, axis=0, ddof=1) / np.sqrt(passes)
-        relative = np.sqrt(np.mean(spread**2)) / max(np.mean(totals), 1e-30)
-        return radiance.astype(np.float32), float(100.0 * relative)
+            yield gather.picture(sight, light.upward)
 
-    def _reference(
-        self, sight: Sight, samples: int, seed: int, tell: Callable[[float], None]
-    ) -> tuple[NDArray[np.float32], float]:
+    def _followed(self, sight: Sight, samples: int, seed: int) -> Iterator[NDArray[np.floating]]:
+        """Pictures (n_led, rows, columns) of independent passes."""
         from . import exact, transport
 
-        ground = transport.survey(self.scene, self.sensor)
-        each = max(_PATHS_PER_PASS // len(self.sensor.leds), 1)
-        passes = max(2, -(-samples // each))
-        total, squares = None, None
-        for number in range(passes):
-            seen = exact.exact(
-                self.scene,
-                self.sensor,
-                self.table,
-                self.rays,
-                ground.fraction,
-                -(-samples // passes),
-                seed * _MOST_PASSES + number,
-            )
-            layers = 1e6 * (np.einsum("snyx,syx->nyx", seen, sight.windows) + sight.lamps)
-            whole = layers.sum(axis=0)
-            total = layers if total is None else total + layers
-            squares = whole**2 if squares is None else squares + whole**2
-            tell((number + 1) / passes)
-        assert total is not None and squares is not None
-        mean = total / passes
-        whole = mean.sum(axis=0)
-        spread2 = np.maximum(squares / passes - whole**2, 0.0) / (passes - 1)
-        return mean.astype(np.float32), float(100.0 * np.sqrt(spread2.mean()) / max(whole.mean(), 1e-30))
+        fraction = transport.survey(self.scene, self.sensor).fraction
+        parts = (self.scene, self.sensor, self.table, self.rays, fraction, samples)
+        for number in range(_MOST_PASSES):
+            seen = exact.exact(*parts, seed * _MOST_PASSES + number)
+            yield 1e6 * (np.einsum("snyx,syx->nyx", seen, sight.windows) + sight.lamps)
+
+
+def _averaged(
+    pictures: Iterator[NDArray[np.floating]], passes: int, noise: float | None, tell: Callable[[float], None]
+) -> tuple[Array, float]:
+    """Mean of so many pictures, or as many as the noise asks for, and the noise of the mean in per cent."""
+    total: Array | float = 0.0
+    whole: Array | float = 0.0
+    squares: Array | float = 0.0
+    for number, picture in enumerate(pictures, start=1):
+        layers = np.asarray(picture, dtype=np.float64)
+        bright = layers.sum(axis=0)
+        total, whole, squares = total + layers, whole + bright, squares + bright**2
+        if number < min(passes, _LEAST_PASSES):
+            continue
+        variance = np.maximum(squares - whole**2 / number, 0.0) / max(number - 1, 1) / number
+        found = float(100.0 * np.sqrt(variance.mean()) / max(np.mean(whole) / number, 1e-30))
+        left = passes - number if noise is None else int(np.ceil(number * ((found / noise) ** 2 - 1.0)))
+        tell(number / (number + max(left, 0)))
+        if left <= 0:
+            break
+    return np.asarray(total / number), found

@@ -20,6 +20,7 @@ from .tissue import Coupling, TissueOptics
 Array = NDArray[np.float64]
 
 _MOST_ROUNDS = 60
+_BLACK = 1e-12  # share that comes back, below which nothing does
 _NONE = 1e-300  # in place of 0 below a fraction bar
 
 
@@ -91,6 +92,8 @@ class Spread:
         key hestenes1952). M is applied in single precision, always to a residual: the error shrinks with it.
         """
         residual, found = source, np.zeros_like(source)
+        if np.abs(self.transform).max() < _BLACK:  # a black sheet: no round would get nearer
+            return found
         spread = self.convolve(residual)
         way, spread_way = residual, spread
         power = _dot(residual, spread)

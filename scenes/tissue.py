@@ -7,9 +7,10 @@ step. Light comes in and goes out spread over angles; the reflectance is written
 
 with µ the cosine in the tissue and E_i = ∫ φ_i T L dω the weighted irradiance that enters. Mode 0 is all
 that forgets its direction: φ_0(µ) is the plane albedo over the total reflectance ρ_0, so that the total is
-right for every angle, and R_0 spreads light over about a millimetre. The others are what single and double
-scattering remember (grazing light leaves at grazing angles): they have no net flux, return within a fraction
-of a mean free path, and are taken as local. W(A_r) is what the face throws back into the tissue.
+right for every angle, and R_0 spreads light over about a millimetre. The others are what light scattered a
+few times remembers (grazing light leaves at grazing angles): they have no net flux, return within a fraction
+of a mean free path, and are taken as local. Mode 1 makes what leaves towards the camera right for light from
+any angle; the next are the largest of what is left. W(A_r) is what the face throws back into the tissue.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ Array = NDArray[np.float64]
 
 MODES = 2
 _COSINES = 513
+_CAMERA = 0.985  # cosine in the tissue at which mode 1 is exact: what the camera sees
 _LEAST = 1e-12  # reflectance below which nothing comes back
 
 
@@ -100,6 +102,8 @@ class Coupling:
         (n1/n3)²: radiance in the guide over that in the tissue.
     free : (modes, modes)
         W of bare skin beside the guide, in air.
+    skew : (n_cos,)
+        φ_0 times how far ahead light that enters aslant comes out, mm; see `skewed`.
     """
 
     lobes: Array
@@ -107,6 +111,7 @@ class Coupling:
     gain: Array
     scale: float
     free: Array
+    skew: Array
 
 
 def tissue_optics(
@@ -132,19 +137,25 @@ def tissue_optics(
     if total < _LEAST:
         lobes = np.vstack([np.ones((1, _COSINES)), np.zeros((modes - 1, _COSINES))])
         return TissueOptics(transport, body, curve, np.zeros(modes), lobes)
-    at_nodes, at_grid = body.factors(mu), body.factors(grid)
-    plane, shape = at_nodes @ even / total, at_grid @ even / total
-    rest = at_nodes - total * np.outer(plane, plane)
-    root = np.sqrt(even)
-    values, vectors = np.linalg.eigh(0.5 * (rest + rest.T) * np.outer(root, root))
-    order = np.argsort(-np.abs(values))[: modes - 1]
-    strengths, modes_of = [total], [shape]
-    for number in order:
-        on_nodes = vectors[:, number] / root
-        extended = (at_grid - total * np.outer(shape, plane)) @ (even * on_nodes) / values[number]
-        strengths.append(values[number])
-        modes_of.append(extended * np.sign(extended[1]))
-    return TissueOptics(transport, body, curve, np.array(strengths), np.stack(modes_of))
+    nodes, out = body.factors(mu), body.factors(grid)  # (to, from) cosines
+    plane, shape = nodes @ even / total, out @ even / total
+    strengths, shapes = [total], [shape]
+    nodes, out = nodes - total * np.outer(plane, plane), out - total * np.outer(shape, plane)
+    camera, root = int(np.argmin(np.abs(mu - _CAMERA))), np.sqrt(even)
+    for number in range(1, modes):
+        values, vectors = np.linalg.eigh(0.5 * (nodes + nodes.T) * np.outer(root, root))
+        largest = int(np.argmax(np.abs(values)))
+        strength, on_nodes = values[largest], vectors[:, largest] / root
+        on_grid = out @ (even * on_nodes) / strength
+        norm = even @ nodes[:, camera] ** 2
+        if number == 1 and 0.0 < norm < 3.0 * abs(strength) * nodes[camera, camera]:
+            strength = norm / nodes[camera, camera]
+            on_nodes, on_grid = nodes[:, camera] / np.sqrt(norm), out[:, camera] / np.sqrt(norm)
+        strengths.append(float(strength))
+        shapes.append(on_grid)
+        nodes = nodes - strength * np.outer(on_nodes, on_nodes)
+        out = out - strength * np.outer(on_grid, on_nodes)
+    return TissueOptics(transport, body, curve, np.array(strengths), np.stack(shapes))
 
 
 @lru_cache(maxsize=16)
@@ -172,7 +183,23 @@ def couple(optics: ContactOptics, tissue: TissueOptics, n_guide: float, n_tissue
     passed = np.einsum("m,im,jm,am->aij", moments, lobes, lobes, optics.transmittance, optimize=True)
     held = overlap - scale * passed
     free = overlap - _passed_by_bare_skin(tissue, n_tissue)
-    return Coupling(lobes, held, scale * _resummed(tissue.strengths, held), scale, free)
+    ahead = np.interp(np.sqrt(np.maximum(inside, 0.0)), np.linspace(0.0, 1.0, _COSINES), skewed(tissue))
+    skew = np.where(inside > 0.0, ahead, 0.0)
+    return Coupling(lobes, held, scale * _resummed(tissue.strengths, held), scale, free, skew)
+
+
+def skewed(tissue: TissueOptics) -> Array:
+    """φ_0 times the mean run, mm, of light along its way in before it comes out, on the cosines of `lobes`.
+
+    All collisions after the first forget where the light came from, so the run is that to the first one, over
+    what comes out: with the plane albedo R(µ) = ∫ exp(-τ/µ) P(τ) dτ/µ, P the share that comes out of the
+    depth τ, it is sinθ (R + µ dR/dµ) / (R µt'). For a diffusing half-space that is near sinθ/µt', as
+    measured by Wang & Jacques (1995; key wang1995b).
+    """
+    cosine = np.linspace(0.0, 1.0, tissue.lobes.shape[1])
+    plane = tissue.lobes[0]
+    run = np.sqrt(1.0 - cosine**2) / tissue.transport_per_mm
+    return np.asarray(run * (plane + cosine * np.gradient(plane, cosine)))
 
 
 def _passed_by_bare_skin(tissue: TissueOptics, n_tissue: float) -> Array:

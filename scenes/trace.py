@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from .bsdf import Table
 from .build import led_frame
-from .irradiance import AngularBasis, look_up, weigh
+from .irradiance import AngularBasis, look_up
+from .lamp import Patterns
 from .sensor import Sensor
 from .tissue import Coupling
 
@@ -45,8 +46,8 @@ class Landed:
 
     Attributes
     ----------
-    maps : (n_led, count, CELLS, CELLS)
-        Sum of throughput times columns[k](cos) on cells [iy, ix] of the deformed surface over the guide's
+    maps : (n_led, layers, CELLS, CELLS)
+        Sum of throughput times the basis' weights on cells [iy, ix] of the deformed surface over the guide's
         face, without what `direct` gathers.
     sinks : (n_led, len(SINKS))
         Sum of throughput that ended there, gathered light included.
@@ -84,10 +85,9 @@ def walk(
     seed
         The result depends on nothing else, not even on the number of threads.
     """
-    n_led, count, width = len(sensor.leds), basis.count, sensor.guide.width_mm
-    n_cos = basis.columns.shape[1]
-    weights = mi.Float(np.ascontiguousarray(basis.columns.T, dtype=np.float32).ravel())
-    maps = dr.zeros(mi.Int64, n_led * count * CELLS * CELLS)
+    n_led, layers, width = len(sensor.leds), basis.layers, sensor.guide.width_mm
+    weights = basis.weights()
+    maps = dr.zeros(mi.Int64, n_led * layers * CELLS * CELLS)
     named = {shape.id(): mi.ShapePtr(shape) for shape in scene.shapes()}
     contact = next(shape for shape in scene.shapes() if shape.id() == "contact")
     on = mi.ShapePtr(contact)
@@ -120,9 +120,9 @@ def walk(
         lands = on_contact & ~gathered & (si.n.z < -0.5)
         column = mi.UInt32(dr.clip((si.p.x / width + 0.5) * CELLS, 0.0, CELLS - 1.0))
         row = mi.UInt32(dr.clip((si.p.y / width + 0.5) * CELLS, 0.0, CELLS - 1.0))
-        for k, weight in enumerate(weigh(weights, count, n_cos, cosine, lands)):
+        for k, weight in enumerate(weights.at(cosine, ray.d.x, ray.d.y, lands)):
             amount = mi.Int64(dr.round(throughput * weight * _FIXED_POINT))
-            cell = ((number * count + k) * CELLS + row) * CELLS + column
+            cell = ((number * layers + k) * CELLS + row) * CELLS + column
             dr.scatter_add(maps, amount, cell, lands)
         trapped = dr.select(
             on_contact & (trapped < 0.0), dr.select(cosine < critical, throughput, 0.0), trapped
@@ -138,7 +138,7 @@ def walk(
         direction = dr.select(on_contact, mi.reflect(si.wi), direction)
         kept = dr.select(on_contact, throughput - entering, throughput * share)
         stopped = dr.select(elsewhere, throughput - kept, 0.0)
-        on_led = _one_of(si.shape, named, "led_")
+        on_led = one_of(si.shape, named, "led_")
         sink["leds"] += dr.select(on_led, stopped, 0.0)
         sink["walls"] += dr.select(on_wall, stopped, 0.0)
         sink["frame"] += dr.select(on_led | on_wall, 0.0, stopped)
@@ -158,16 +158,16 @@ def walk(
 
     dr.eval(maps, end[6:])
     return Landed(
-        maps.numpy().reshape(n_led, count, CELLS, CELLS).astype(np.float64) / _FIXED_POINT,
+        maps.numpy().reshape(n_led, layers, CELLS, CELLS).astype(np.float64) / _FIXED_POINT,
         np.stack([per_led(amount + dr.zeros(mi.Float, lanes)) for amount in end[7:]], axis=1),
         per_led(dr.maximum(end[6], 0.0)),
     )
 
 
 def emit(sensor: Sensor, number: mi.UInt32, u: list[mi.Float]) -> mi.Ray3f:
-    """Rays from the LEDs' discs, even over area, cosine-weighted over angle."""
-    half = sensor.guide.width_mm / 2
-    frames = np.array([np.concatenate(led_frame(led, half)) for led in sensor.leds])
+    """Rays from the LEDs' discs, even over area, over angle as their patterns say."""
+    half, floor = sensor.guide.width_mm / 2, -sensor.guide.thickness_mm - sensor.glass.thickness_mm
+    frames = np.array([np.concatenate(led_frame(led, half, floor)) for led in sensor.leds])
     radii = np.array([led.diameter_mm / 2 for led in sensor.leds])
     columns = [mi.Float(column.astype(np.float32)) for column in (*frames.T, radii)]
     centre, axis, tangent = (
@@ -175,7 +175,11 @@ def emit(sensor: Sensor, number: mi.UInt32, u: list[mi.Float]) -> mi.Ray3f:
     )
     radius = dr.gather(mi.Float, columns[9], number)
     on_disc = mi.warp.square_to_uniform_disk_concentric(mi.Point2f(u[0], u[1]))
-    direction = mi.warp.square_to_cosine_hemisphere(mi.Point2f(u[2], u[3]))
+    patterns = Patterns(sensor.leds)
+    direction = patterns.draw(number, mi.Point2f(u[2], u[3]))
+    if not patterns.lambertian:  # their y is the LED's upright, this frame's t that or its opposite
+        signs = [-1.0 if led.side in ("+x", "-y") else 1.0 for led in sensor.leds]
+        direction.y *= dr.gather(mi.Float, mi.Float(signs), number)
     frame = mi.Frame3f(tangent, dr.cross(axis, tangent), axis)
     origin = centre + radius * (on_disc.x * frame.s + on_disc.y * frame.t)
     away = frame.to_world(direction)
@@ -259,7 +263,7 @@ def bounce_off(
 ) -> tuple[mi.Vector3f, mi.Float, mi.Bool]:
     """Direction (local) and share of the light after a face that is not the contact, and whether it is a side
     wall."""
-    on_wall = active & _one_of(si.shape, named, "wall_")
+    on_wall = active & one_of(si.shape, named, "wall_")
     painted = _painted(sensor, si, on_wall)
     context = mi.BSDFContext(mi.TransportMode.Importance)
     scattered, weight = si.bsdf(ray).sample(context, si, sample1, sample2, active & ~painted)
@@ -279,14 +283,14 @@ def _painted(sensor: Sensor, si: mi.SurfaceInteraction3f, on_wall: mi.Bool) -> m
         return mi.Bool(False)
     half, painted = sensor.guide.width_mm / 2, on_wall
     for led in sensor.leds:
-        if led.coupling == "air":
+        if led.coupling == "air" and led.side != "below":
             centre, axis, _ = led_frame(led, half)
             middle = mi.Point3f(*(centre + led.gap_mm * axis).tolist())
             painted = painted & (dr.squared_norm(si.p - middle) > led.window_mm**2)
     return painted
 
 
-def _one_of(shape: mi.ShapePtr, named: dict[str, mi.ShapePtr], prefix: str) -> mi.Bool:
+def one_of(shape: mi.ShapePtr, named: dict[str, mi.ShapePtr], prefix: str) -> mi.Bool:
     """Whether a shape is one of those whose name begins so."""
     found = mi.Bool(False)
     for name, pointer in named.items():

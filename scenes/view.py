@@ -1,8 +1,14 @@
-"""What the camera's pinhole sees: pixel rays refracted through the glass's two flat faces, in closed form."""
+"""What the camera's pinhole sees: pixel rays through its lens and the glass's two flat faces, in closed form.
+
+The lens maps the tangent r of a ray's angle in air to d(r) = r (1 + k1 r² + k2 r⁴) times its image
+distance (radial terms of Brown 1971; key brown1971). `air_directions` inverts d, `picture_points` goes the
+other way.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,10 +41,10 @@ class PixelRays:
 
 
 def tangent_scale(sensor: Sensor) -> float:
-    """Tangent of the ray angle in air per mm on the camera's sensor.
+    """Distorted tangent of the ray angle in air per mm on the camera's sensor: 1 over the image distance.
 
     Chosen so that the picture is exactly `field_of_view_mm` wide where its middle row meets the contact
-    surface, refraction included; the optics are otherwise rectilinear.
+    surface, refraction included; the optics are otherwise rectilinear, but for the lens's distortion.
     """
     edge = sensor.camera.field_of_view_mm / 2
 
@@ -46,23 +52,66 @@ def tangent_scale(sensor: Sensor) -> float:
         return _reach(sensor, sine) - edge
 
     sine = float(brentq(miss, 0.0, np.sin(np.arctan(edge / sensor.camera.distance_mm)), xtol=1e-15))
-    return float(sine / np.sqrt(1.0 - sine**2) / (0.5e-3 * sensor.camera.columns * sensor.camera.pixel_um[0]))
+    tangent = sine / np.sqrt(1.0 - sine**2) * (1.0 + _stretch(sensor, sine**2 / (1.0 - sine**2)))
+    return float(tangent / (0.5e-3 * sensor.camera.columns * sensor.camera.pixel_um[0]))
 
 
 def air_directions(sensor: Sensor, column: Array, row: Array) -> Array:
     """Unit directions (..., 3) in air, from the pinhole up, of picture coordinates (x.5 are pixels'
     middles)."""
-    camera, scale = sensor.camera, tangent_scale(sensor)
-    tangent_x = (np.asarray(column) - camera.columns / 2) * camera.pixel_um[0] * 1e-3 * scale
-    tangent_y = -(np.asarray(row) - camera.rows / 2) * camera.pixel_um[1] * 1e-3 * scale
+    (rows, columns), (width, height) = sensor.camera.shape, sensor.camera.pitch_mm
+    scale = tangent_scale(sensor)
+    tangent_x = (np.asarray(column) - columns / 2) * width * scale
+    tangent_y = -(np.asarray(row) - rows / 2) * height * scale
+    if any(sensor.camera.distortion):
+        shrink = _undistort(sensor, np.hypot(tangent_x, tangent_y))
+        tangent_x, tangent_y = tangent_x * shrink, tangent_y * shrink
     direction = np.stack(np.broadcast_arrays(tangent_x, tangent_y, np.ones_like(tangent_x)), axis=-1)
     return np.asarray(direction / np.linalg.norm(direction, axis=-1, keepdims=True))
+
+
+def picture_points(sensor: Sensor, direction: Array) -> tuple[Array, Array]:
+    """Column and row (...) at which the lens images rays of these directions (..., 3) in air, +z up."""
+    (rows, columns), (width, height) = sensor.camera.shape, sensor.camera.pitch_mm
+    tangent = direction[..., :2] / direction[..., 2:]
+    spread = 1.0 + _stretch(sensor, np.sum(tangent**2, axis=-1))
+    x, y = np.moveaxis(tangent * (spread / tangent_scale(sensor))[..., None], -1, 0)
+    return columns / 2 + x / width, rows / 2 - y / height
+
+
+def crowding(sensor: Sensor, direction: Array) -> Array:
+    """Area of undistorted tangents per area of distorted ones, 1 without distortion: (r/d)(dr/dd)."""
+    square = np.sum((direction[..., :2] / direction[..., 2:]) ** 2, axis=-1)
+    k1, k2 = sensor.camera.distortion
+    slope = 1.0 + 3.0 * k1 * square + 5.0 * k2 * square**2
+    return np.asarray(1.0 / (slope * (1.0 + _stretch(sensor, square))))
+
+
+def _stretch(sensor: Sensor, square: Any) -> Any:
+    """d(r)/r - 1 of the squared tangent r²."""
+    k1, k2 = sensor.camera.distortion
+    return k1 * square + k2 * square**2
+
+
+def _undistort(sensor: Sensor, distorted: Array) -> Array:
+    """r/d(r) for given d, by Newton's method."""
+    k1, k2 = sensor.camera.distortion
+    tangent = distorted.copy()
+    for _ in range(30):
+        square = tangent**2
+        miss = tangent * (1.0 + k1 * square + k2 * square**2) - distorted
+        tangent = tangent - miss / np.maximum(1.0 + 3.0 * k1 * square + 5.0 * k2 * square**2, 0.05)
+    back = tangent * (1.0 + _stretch(sensor, tangent**2))
+    if np.abs(back - distorted).max() > 1e-9:
+        raise ValueError(f"camera.distortion: received {(k1, k2)}; allowed less: the picture has no corners")
+    return np.where(distorted > 0.0, tangent / np.where(distorted > 0.0, distorted, 1.0), 1.0)
 
 
 def pixel_rays(sensor: Sensor) -> PixelRays:
     """Refract the ray through the middle of each pixel into the guide."""
     camera, glass, guide = sensor.camera, sensor.glass, sensor.guide
-    column, row = np.arange(camera.columns) + 0.5, np.arange(camera.rows)[:, None] + 0.5
+    rows, columns = camera.shape
+    column, row = np.arange(columns) + 0.5, np.arange(rows)[:, None] + 0.5
     in_air = air_directions(sensor, *np.broadcast_arrays(column, row))
     in_glass = _refract(in_air, glass.refractive_index)
     in_guide = _refract(in_air, guide.refractive_index)
@@ -70,7 +119,23 @@ def pixel_rays(sensor: Sensor) -> PixelRays:
     offset = offset + in_glass[..., :2] / in_glass[..., 2:] * glass.thickness_mm
     origin = np.concatenate([offset, np.full((*offset.shape[:2], 1), -guide.thickness_mm)], axis=-1)
     transmittance = 1.0 - faces_reflectance(sensor, in_guide[..., 2])
+    transmittance = np.where(_blocked(sensor, in_air, in_glass), 0.0, transmittance)
     return PixelRays(origin, in_guide, transmittance, 1.0 / guide.refractive_index**2)
+
+
+def _blocked(sensor: Sensor, in_air: Array, in_glass: Array) -> NDArray[np.bool_]:
+    """Which rays meet the black back of an LED below, (rows, columns)."""
+    lean_air, lean_glass = (rays[..., :2] / rays[..., 2:] for rays in (in_air, in_glass))
+    blocked = np.zeros(in_air.shape[:2], bool)
+    for led in sensor.leds:
+        if led.side != "below":
+            continue
+        in_front = led.gap_mm if led.coupling == "air" else 0.0
+        meets = lean_air * (sensor.camera.distance_mm - in_front)
+        if led.coupling == "embedded":
+            meets = meets + lean_glass * led.gap_mm
+        blocked |= np.hypot(meets[..., 0] - led.x_mm, meets[..., 1] - led.y_mm) < led.diameter_mm / 2
+    return blocked
 
 
 def faces_reflectance(sensor: Sensor, cosine: Array) -> Array:

@@ -258,6 +258,17 @@ def fresnel(n_body: float, n_before: float) -> Passing:
     return passing if n_body != n_before else lambda where, cosine: mi.Float(1.0)
 
 
+def behind_guide(n_body: float, n_guide: float, transmittance: Passing) -> Passing:
+    """A face whose transmittance is known for cosines in the guide (`bsdf.Table`): the same both ways."""
+    square = (n_body / n_guide) ** 2
+
+    def passing(where: mi.Point3f, cosine: mi.Float) -> mi.Float:
+        inside = 1.0 - square * (1.0 - dr.square(cosine))
+        return dr.select(inside > 0.0, transmittance(where, dr.safe_sqrt(inside)), 0.0)
+
+    return passing
+
+
 def _collision(medium: Medium, majorant: float) -> tuple[float, float, float]:
     """Share kept per collision, chance that a collision is real, and g."""
     extinction = medium.extinction_per_mm

@@ -105,7 +105,7 @@ def test_table_on_the_device_equals_numpys_interpolation(mi: ModuleType) -> None
         (
             table.transmittance(fraction, cosine),
             table.hemispherical(fraction),
-            table.diffuse_gain(fraction),
+            table.diffuse(fraction, cosine, cosine),
         ),
         zip(*expected, strict=True),
         strict=True,

@@ -217,3 +217,48 @@ def test_bad_radiance_is_refused_in_one_line(radiance, message):
 def test_bad_frames_are_refused(frames):
     with pytest.raises(CameraError, match="frames"):
         expose(PAPER, flat(PAPER, 1.0), WAVELENGTH_NM, generator(1), frames=frames)
+
+
+def test_binned_pixels_add_light_and_read_once():
+    """Four times the electrons and the full well; the read noise of one; the pattern is the camera's own."""
+    camera = replace(FINE, binning=2, gain_e_per_dn=4.0)
+    light = np.ones((246, 384)) * 10000.0 / mean_electrons(FINE, np.ones((492, 768)), WAVELENGTH_NM)[0, 0]
+    assert mean_electrons(camera, light, WAVELENGTH_NM)[0, 0] == pytest.approx(40000.0, rel=1e-12)
+    dark = expose(camera, 0 * light, WAVELENGTH_NM, generator(1)).astype(float)
+    assert dark.std() * 4.0 == pytest.approx(np.hypot(12.0, 4.0 / np.sqrt(12)), rel=0.02)
+    full = expose(replace(camera, read_noise_e=0.0), 100 * light, WAVELENGTH_NM, generator(1))
+    assert np.all(full == round(4 * 45000 / 4.0 + 200))
+    fine, _ = fixed_pattern(replace(PAPER, prnu_percent=2.0))
+    coarse, _ = fixed_pattern(replace(PAPER, prnu_percent=2.0, binning=2))
+    np.testing.assert_allclose(coarse, fine.reshape(246, 2, 384, 2).mean(axis=(1, 3)), rtol=1e-12)
+
+
+def test_mean_of_rounded_frames_loses_what_rounding_took():
+    """Without noise to dither it, averaging cannot bring back a fraction of a count."""
+    quiet = replace(FINE, read_noise_e=0.0, gain_e_per_dn=1000.0)
+    mean = expose(quiet, flat(quiet, 0.0), WAVELENGTH_NM, generator(1), frames=64)
+    assert np.all(mean == 200.0)
+    coarse = replace(quiet, offset_dn=200.4)
+    assert np.all(expose(coarse, flat(coarse, 0.0), WAVELENGTH_NM, generator(1), frames=64) == 200.0)
+
+
+def colour_camera(**changes) -> Camera:
+    table = {"wavelength_nm": (400.0, 700.0), "R": (0.1, 0.3), "G": (0.5, 0.5), "B": (0.4, 0.0)}
+    return Camera(**{**as_arguments(PAPER), "colour": "rgb", "quantum_efficiency": table, **changes})
+
+
+def as_arguments(camera: Camera) -> dict:
+    return {name: getattr(camera, name) for name in camera.__dataclass_fields__}
+
+
+def test_colour_channels_have_their_own_photons_and_pattern():
+    camera = colour_camera()
+    light = np.ones((492, 768, 3))
+    electrons = mean_electrons(camera, light, WAVELENGTH_NM)
+    mono = mean_electrons(replace(PAPER, quantum_efficiency=1.0), np.ones((492, 768)), WAVELENGTH_NM)[0, 0]
+    np.testing.assert_allclose(electrons[0, 0] / mono, [0.3, 0.5, 0.4], rtol=1e-12)
+    picture = expose(camera, light * 0.5, WAVELENGTH_NM, generator(1))
+    assert picture.shape == (492, 768, 3) and picture.dtype == np.uint8
+    noise = (picture - picture.mean(axis=(0, 1))).reshape(-1, 3)
+    assert np.abs(np.corrcoef(noise.T) - np.eye(3)).max() < 0.01
+    np.testing.assert_allclose(camera.efficiency([400.0, 550.0, 800.0])[0], [0.1, 0.2, 0.0], atol=1e-12)

@@ -25,7 +25,7 @@ def data():
 
 def test_the_shipped_design_is_the_papers_sensor():
     design = load_design("tsis")
-    assert shipped_designs() == ["tsis"]
+    assert shipped_designs() == ["rgb", "tsis", "white"]
     assert design.name == "tsis"
     assert design.waveguide.width_mm == 25 and design.waveguide.thickness_mm == 10
     assert [(layer.thickness_mm, layer.modulus_kPa) for layer in design.waveguide.layers] == [
@@ -367,5 +367,7 @@ def test_a_path_is_read_and_a_missing_one_is_named(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text(TSIS.replace('name = "tsis"', 'name = "mine"'), encoding="utf-8")
     assert load_design(path).name == "mine"
-    with pytest.raises(DesignError, match=r"absent.toml'; allowed a shipped design \(tsis\) or a TOML file"):
+    with pytest.raises(
+        DesignError, match=r"absent.toml'; allowed a shipped design \(rgb, tsis, white\) or a TOML file"
+    ):
         load_design(tmp_path / "absent.toml")

@@ -1,10 +1,13 @@
 """Gathered LED light against closed forms and against rays thrown by hand."""
 
 import dataclasses
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from sensors import paper_sensor
+from test_lamp import SKEWED_FLUX, skewed, write_skewed
 
 from scenes.sensor import Led, Sensor
 from scenes.surface import flat
@@ -13,7 +16,7 @@ RAYS = 2_000_000
 BLOCKS = 10  # per side, of the comparison with thrown rays
 
 
-def alone(coupling: str, **changes: float) -> Sensor:
+def alone(coupling: str, **changes: Any) -> Sensor:
     """The sensor with one LED, on the side +x."""
     led = dataclasses.replace(paper_sensor(coupling).leds[0], side="+x", **changes)
     return dataclasses.replace(paper_sensor(coupling), leds=(led,))
@@ -24,7 +27,7 @@ def irradiance(one: Sensor) -> np.ndarray:
     from scenes.direct import direct
     from scenes.irradiance import AngularBasis
 
-    everything = AngularBasis(np.ones((2, 1)), np.ones((1, 2)))
+    everything = AngularBasis(np.ones((1, 2, 1)), np.ones((1, 2)), np.zeros((2, 0)), np.zeros((0, 2)))
     return direct(one, everything, flat(one.guide.width_mm, 0.0))[0, 0]
 
 
@@ -35,6 +38,16 @@ def fresnel(n1: float, n2: float, cos1: np.ndarray) -> np.ndarray:
     s = (n1 * cos1 - n2 * cos2) / (n1 * cos1 + n2 * cos2)
     p = (n2 * cos1 - n1 * cos2) / (n2 * cos1 + n1 * cos2)
     return np.where(sine < 1, 0.5 * (s**2 + p**2), 1.0)
+
+
+def factor(led: Led, cosine: np.ndarray, along: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Intensity over that of a Lambertian disc: of cos^m, and of the file of `test_lamp` in closed form."""
+    if led.pattern == "power":
+        assert led.exponent is not None
+        return np.asarray((led.exponent + 1) / 2 * cosine ** (led.exponent - 1))
+    if led.pattern == "ies":
+        return np.asarray(skewed(cosine, np.arctan2(up, along)) * np.pi / SKEWED_FLUX / cosine)
+    return np.ones_like(cosine)
 
 
 def thrown(one: Sensor, seed: int = 5) -> np.ndarray:
@@ -48,7 +61,7 @@ def thrown(one: Sensor, seed: int = 5) -> np.ndarray:
     y, z = led.along_mm + radius * np.cos(turn), led.z_mm + radius * np.sin(turn)
     sine2, turn = random.random(RAYS), 2 * np.pi * random.random(RAYS)
     d = np.stack([-np.sqrt(1 - sine2), np.sqrt(sine2) * np.cos(turn), np.sqrt(sine2) * np.sin(turn)])
-    weight = np.full(RAYS, led.flux_W / RAYS)
+    weight = led.flux_W / RAYS * factor(led, -d[0], d[1], d[2])
     if led.coupling == "air":
         step = led.gap_mm / -d[0]
         y, z, x = y + step * d[1], z + step * d[2], np.full(RAYS, half)
@@ -68,6 +81,25 @@ def thrown(one: Sensor, seed: int = 5) -> np.ndarray:
     weight = weight * np.where(down, back, 1.0)
     edges = np.linspace(-half, half, BLOCKS + 1)
     return np.histogram2d(y, x, bins=(edges, edges), weights=weight)[0]
+
+
+@pytest.mark.parametrize("coupling", ["air", "embedded"])
+@pytest.mark.parametrize("pattern", ["power", "ies"])
+def test_patterns_power_per_block_equals_that_of_thrown_rays(
+    variant: str, tmp_path: Path, coupling: str, pattern: str
+) -> None:
+    """cos^4, and a lamp that sends more light to one side; no symmetry helps."""
+    given: dict[str, Any] = {"exponent": 4.0} if pattern == "power" else {"ies": write_skewed(tmp_path)}
+    one = alone(coupling, along_mm=3.0, z_mm=-3.5, pattern=pattern, **given)
+    ours, theirs = blocks(irradiance(one), one.guide.width_mm), thrown(one)
+    sigma = np.sqrt(theirs * 2.5 * one.leds[0].flux_W / RAYS)  # a ray carries at most 2.5 flux/RAYS
+    assert np.abs(ours - theirs).max() < 5e-4 * one.leds[0].flux_W
+    strong = theirs > 1e-3 * one.leds[0].flux_W
+    assert strong.sum() > 20
+    assert np.all(np.abs(ours - theirs)[strong] < 5 * sigma[strong] + 2e-3 * theirs[strong])
+    assert abs(ours.sum() / theirs.sum() - 1) < 3e-3
+    plain = blocks(irradiance(alone(coupling, along_mm=3.0, z_mm=-3.5)), one.guide.width_mm)
+    assert np.abs(ours - plain).max() > 0.005 * one.leds[0].flux_W  # it would be seen if it were left out
 
 
 def blocks(values: np.ndarray, width_mm: float) -> np.ndarray:

@@ -138,11 +138,44 @@ def test_png_round_trip_and_same_bytes(tmp_path, dtype):
 
 
 @pytest.mark.parametrize(
-    "image", [np.zeros((3, 4)), np.zeros((3, 4, 3), np.uint8), np.zeros((0, 4), np.uint8)]
+    "image", [np.zeros((3, 4)), np.zeros((3, 4, 2), np.uint8), np.zeros((0, 4), np.uint8)]
 )
 def test_png_refuses_what_is_not_counts(tmp_path, image):
     with pytest.raises(ImageError, match="uint8 or uint16"):
         write_png(tmp_path / "a.png", image)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_colour_png_round_trip_and_damage(tmp_path, dtype):
+    rng = np.random.Generator(np.random.Philox(3))
+    image = rng.integers(0, np.iinfo(dtype).max, (20, 30, 3), dtype=dtype, endpoint=True)
+    write_png(tmp_path / "a.png", image)
+    back = read_png(tmp_path / "a.png")
+    assert back.dtype == dtype
+    np.testing.assert_array_equal(back, image)
+    with Image.open(tmp_path / "a.png") as seen:  # an independent reader: 16 bits are cut to 8 there
+        np.testing.assert_allclose(np.array(seen), image / (257 if dtype == np.uint16 else 1), atol=1)
+    data = (tmp_path / "a.png").read_bytes()
+    for broken in (data[: len(data) // 2], data[:60], data[:-30], data[:70] + b"xx" + data[72:]):
+        (tmp_path / "b.png").write_bytes(broken)
+        with pytest.raises(ImageError) as caught:
+            read_png(tmp_path / "b.png")
+        assert "\n" not in str(caught.value)
+
+
+def test_deep_colour_png_with_filtered_lines_is_read(tmp_path):
+    """Lines written by Sub and Up of ISO/IEC 15948, section 9.2, as other programs filter them."""
+    from scenes.png import _chunk, decode
+
+    image = np.random.Generator(np.random.Philox(5)).integers(0, 65536, (3, 5, 3)).astype(">u2")
+    raw = image.view(np.uint8).reshape(3, 5, 6)
+    lines = [b"\0" + raw[0].tobytes()]
+    lines.append(b"\2" + (raw[1] - raw[0]).tobytes())
+    lines.append(b"\1" + np.diff(raw[2], axis=0, prepend=np.zeros((1, 6), np.uint8)).tobytes())
+    header = (5).to_bytes(4, "big") + (3).to_bytes(4, "big") + b"\x10\x02\0\0\0"
+    parts = ((b"IHDR", header), (b"IDAT", zlib.compress(b"".join(lines))), (b"IEND", b""))
+    file = b"\x89PNG\r\n\x1a\n" + b"".join(_chunk(*part) for part in parts)
+    np.testing.assert_array_equal(decode(file), image)
 
 
 def test_bad_png_is_one_line(tmp_path):
@@ -159,8 +192,8 @@ def test_bad_png_is_one_line(tmp_path):
     (tmp_path / "b.png").write_bytes(zlib.compress(b"no"))
     with pytest.raises(ImageError, match="not a PNG"):
         read_png(tmp_path / "b.png")
-    Image.new("RGB", (4, 4)).save(tmp_path / "c.png")
-    with pytest.raises(ImageError, match="mode RGB"):
+    Image.new("RGBA", (4, 4)).save(tmp_path / "c.png")
+    with pytest.raises(ImageError, match="mode RGBA"):
         read_png(tmp_path / "c.png")
 
 

@@ -125,8 +125,23 @@ def test_same_bits_every_time_and_each_led_on_its_own() -> None:
     np.testing.assert_allclose(spread.solve(light[2:3], fraction)[0], together[2], rtol=3e-6)
 
 
-def test_dark_stays_dark() -> None:
-    assert np.all(setting()[3].solve(np.zeros((1, 2, 100, 100)), patchy(100)) == 0.0)
+def test_dark_stays_dark_and_a_black_sheet_gives_nothing_back() -> None:
+    optics, _, _, spread = setting()
+    assert np.all(spread.solve(np.zeros((1, 2, 100, 100)), patchy(100)) == 0.0)
+    black = tissue_optics(0.0, 30.0, 0.3)
+    nothing = spreader(black, couple(optics, black, N1, N3), WIDTH, 100)
+    assert np.all(nothing.solve(np.ones((1, 2, 100, 100)), patchy(100))[:, 0] == 0.0)
+
+
+def test_light_enters_and_leaves_a_thin_white_sheet_at_the_same_place() -> None:
+    """A sheet of a tenth of a cell: the local gain at every cell but the rim's."""
+    optics = contact_optics(N1, 1.0, N3, 0.5, 10.0, 550.0)
+    sheet = tissue_optics(20.0, 0.1, 0.02, 0.8)
+    coupling = couple(optics, sheet, N1, N3)
+    light = np.zeros((1, 2, 100, 100))
+    light[0, 0] = 1.0
+    upward = spreader(sheet, coupling, WIDTH, 100).solve(light, np.full((100, 100), 0.25))[0, :, 50, 50]
+    np.testing.assert_allclose(upward * coupling.scale, coupling.gain[32, :, 0], rtol=2e-4, atol=1e-6)
 
 
 def test_four_leds_take_well_under_a_tenth_of_a_second() -> None:

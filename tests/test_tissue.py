@@ -49,7 +49,7 @@ def test_modes_have_the_plane_albedo_and_no_net_flux() -> None:
     np.testing.assert_allclose(tissue.reflectance * lobes[0], Slab(1 / 1.02).plane_albedo(mu), rtol=2e-4)
 
 
-@pytest.mark.parametrize(("modes", "worst"), [(1, 0.05), (2, 0.008), (3, 0.002)])
+@pytest.mark.parametrize(("modes", "worst"), [(1, 0.05), (2, 1e-3), (3, 1e-3)])
 def test_two_modes_give_what_trapped_light_leaves_for_the_camera(modes: int, worst: float) -> None:
     """In at cosines below 0.7, as trapped light, out above 0.9, as the camera sees; by the exact factors."""
     node, weight = np.polynomial.legendre.leggauss(40)
@@ -115,7 +115,7 @@ def test_sheet_takes_the_tissues_place() -> None:
 def test_thick_sheet_is_tissue_and_a_black_one_gives_nothing() -> None:
     deep, half = tissue_optics(1.0, 0.02, 80.0), tissue_optics(1.0, 0.02)
     r = np.array([0.1, 1.0, 5.0])
-    np.testing.assert_allclose(deep.profile(r), half.profile(r), rtol=1e-6)
+    np.testing.assert_allclose(deep.profile(r), half.profile(r), rtol=1e-5)
     np.testing.assert_allclose(deep.lobes[0], half.lobes[0], rtol=1e-6)
     black = tissue_optics(0.0, 30.0, 0.3)
     assert black.reflectance == 0.0 and np.all(behind(black).gain == 0.0)

@@ -15,6 +15,8 @@ from scenes.sensor import Glass, Guide, Sensor
 SENSORS = {
     "paper": paper_sensor(),
     "near and wide": paper_sensor(distance_mm=12.0, field_of_view_mm=24.0),
+    "barrel": paper_sensor(distortion=(-0.4, 0.1), field_of_view_mm=20.0),
+    "binned, cushion": paper_sensor(distortion=(0.3, 0.2), binning=2, field_of_view_mm=22.0),
     "square pixels, few": paper_sensor(columns=64, rows=48, pixel_um=(10.0, 10.0), field_of_view_mm=20.0),
 }
 
@@ -37,7 +39,7 @@ def through_the_glass(
     mi: ModuleType, sensor: Sensor, scene: Any, columns: np.ndarray, rows: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Follow camera rays through Mitsuba's faces: arrival points (n, 3), transmittance, radiance scale."""
-    film = mi.Point2f(mi.Float(columns / sensor.camera.columns), mi.Float(rows / sensor.camera.rows))
+    film = mi.Point2f(mi.Float(columns / sensor.camera.shape[1]), mi.Float(rows / sensor.camera.shape[0]))
     ray, _ = scene.sensors()[0].sample_ray(
         mi.Float(0.0), sample1=mi.Float(0.0), sample2=film, sample3=mi.Point2f(0.0)
     )
@@ -60,12 +62,10 @@ def through_the_glass(
 @pytest.mark.parametrize("name", SENSORS)
 def test_pixel_rays_arrive_where_mitsubas_refracted_rays_do(mi: ModuleType, name: str) -> None:
     sensor = SENSORS[name]
-    rays, camera = view.pixel_rays(sensor), sensor.camera
+    rays, (rows_, columns_) = view.pixel_rays(sensor), sensor.camera.shape
     rng = np.random.default_rng(4)
-    corners = np.array(
-        [[0, 0], [0, camera.columns - 1], [camera.rows - 1, 0], [camera.rows - 1, camera.columns - 1]]
-    )
-    inside = np.column_stack([rng.integers(0, camera.rows, 300), rng.integers(0, camera.columns, 300)])
+    corners = np.array([[0, 0], [0, columns_ - 1], [rows_ - 1, 0], [rows_ - 1, columns_ - 1]])
+    inside = np.column_stack([rng.integers(0, rows_, 300), rng.integers(0, columns_, 300)])
     row, column = np.concatenate([corners, inside]).T
     arrived, transmittance, scale = through_the_glass(mi, sensor, load(sensor), column + 0.5, row + 0.5)
 
@@ -83,18 +83,19 @@ def test_pixel_rays_arrive_where_mitsubas_refracted_rays_do(mi: ModuleType, name
 def test_middle_row_is_exactly_as_wide_as_the_field_of_view(mi: ModuleType, name: str) -> None:
     sensor = SENSORS[name]
     camera = sensor.camera
-    for column, edge in ((0.0, -0.5), (camera.columns / 2, 0.0), (camera.columns, 0.5)):
+    rows_, columns_ = camera.shape
+    for column, edge in ((0.0, -0.5), (columns_ / 2, 0.0), (columns_, 0.5)):
         assert view_x(sensor, column) == pytest.approx(edge * camera.field_of_view_mm, abs=1e-9)
-    inset = 1e-3 * camera.columns  # the very edge may miss a guide as wide as the field
-    columns = np.array([inset, camera.columns / 2, camera.columns - inset])
-    arrived, _, _ = through_the_glass(mi, sensor, load(sensor), columns, np.full(3, camera.rows / 2))
+    inset = 1e-3 * columns_  # the very edge may miss a guide as wide as the field
+    columns = np.array([inset, columns_ / 2, columns_ - inset])
+    arrived, _, _ = through_the_glass(mi, sensor, load(sensor), columns, np.full(3, rows_ / 2))
     np.testing.assert_allclose(arrived[:, 0], [view_x(sensor, c) for c in columns], atol=1e-3)
     np.testing.assert_allclose(arrived[:, 1], 0.0, atol=1e-5)
 
 
 def view_x(sensor: Sensor, column: float, row: float | None = None, axis: int = 0) -> float:
     """Where a picture coordinate lands on the undeformed surface, x or y, mm, by Snell's law per slab."""
-    row = sensor.camera.rows / 2 if row is None else row
+    row = sensor.camera.shape[0] / 2 if row is None else row
     tangential = view.air_directions(sensor, np.array(column), np.array(row))
     across = float(np.hypot(tangential[0], tangential[1]))
     if across == 0.0:

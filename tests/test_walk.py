@@ -165,6 +165,53 @@ def test_spread_is_the_walk_under_a_face_that_changes_from_place_to_place(
     np.testing.assert_allclose(model, walked, atol=0.025 * walked.max())
 
 
+@pytest.mark.parametrize("fraction", [0.25, 0.5])
+def test_trapped_light_comes_back_to_the_camera_as_the_walk_says(steps: ModuleType, fraction: float) -> None:
+    """Trapped light (cosines 0.25 to 0.7 in the guide) enters a rough contact, evenly over the face.
+
+    What leaves within 20 degrees of the normal, where the camera is, agrees within 0.5 %, and all of it
+    within 0.4 %. Lambertian tissue of the same total is 2 % (a quarter in contact) to 6 % (all) too bright.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    from scenes.bsdf import Table
+
+    optics = contact_optics(N1, 1.0, N3, 0.5, 10.0, 550.0)
+    table, share = Table(Table.pack(optics)), mi.Float(fraction)
+    photons, low, high = 2_000_000, 0.25, 0.7
+    random = steps.generator(photons, 8)
+    s, t = random.next_float32(), random.next_float32()
+    cosine = dr.sqrt(low**2 + (high**2 - low**2) * s)
+    sine = N1 / N3 * dr.sqrt(1.0 - cosine * cosine)
+    across, along = dr.sincos(dr.two_pi * t)
+    inward = mi.Vector3f(sine * along, sine * across, dr.sqrt(1.0 - sine * sine))
+    face = steps.behind_guide(N3, N1, lambda where, cos: table.transmittance(share, cos))
+    body = steps.Body(steps.Medium(1.0, 0.02))
+    _, leaves, weight, _, _ = steps.roam(body, dr.zeros(mi.Point3f, photons), inward, random, face)
+    light = np.array(weight * table.transmittance(share, cosine), dtype=float) / photons
+    outside = 1.0 - (N3 / N1) ** 2 * (
+        1.0 - np.array(leaves.z, dtype=float) ** 2
+    )  # squared cosine in the guide
+    to_camera = np.cos(np.deg2rad(20.0)) ** 2
+    walked = light.sum(), light[outside > to_camera].sum()
+
+    tissue = tissue_optics(1.0, 0.02)
+    coupling = couple(optics, tissue, N1, N3)
+    node = round(128 * fraction)
+    grid, passes = np.linspace(0, 1, 1025), optics.transmittance[node]
+
+    def mean(start: float, stop: float) -> np.ndarray:
+        """⟨T φ_i⟩ over even steps of the squared cosine, (modes,)."""
+        cos = np.sqrt(start + (stop - start) * (np.arange(4000) + 0.5) / 4000)
+        lobes = np.stack([np.interp(cos, grid, lobe) for lobe in coupling.lobes])
+        return np.mean(np.interp(cos, grid, passes) * lobes, axis=1)
+
+    answer = coupling.gain[node] @ mean(low**2, high**2)
+    assert mean(0.0, 1.0) @ answer == pytest.approx(walked[0], rel=0.004)
+    assert mean(to_camera, 1.0) @ answer * (1.0 - to_camera) == pytest.approx(walked[1], rel=0.005)
+
+
 def leaving(tissue: TissueOptics, n_before: float) -> np.ndarray:
     """⟨φ_i T⟩ of a plain face to an index, (modes,)."""
     node, weight = np.polynomial.legendre.leggauss(1000)

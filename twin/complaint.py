@@ -18,6 +18,8 @@ from pydantic_core import ErrorDetails
 
 Location = tuple[str | int, ...]
 
+_TAGS = frozenset({"number", "table"})  # pydantic's names for the kinds of a value that may be either
+
 _NOTHING = object()
 _shorten = reprlib.Repr()
 _shorten.maxstring = _shorten.maxother = 60
@@ -113,7 +115,7 @@ def describe(schema: Mapping[str, Any], location: Location) -> str:
 
 
 def _words(error: ErrorDetails, data: object, schema: Mapping[str, Any]) -> tuple[str, str, str]:
-    location: Location = tuple(error["loc"])
+    location: Location = tuple(step for step in error["loc"] if step not in _TAGS)
     value = _value(data, location)
     received = "nothing" if value is _NOTHING else shown(value)
     match error["type"]:
@@ -140,7 +142,7 @@ def _node(schema: Mapping[str, Any], location: Location) -> Mapping[str, Any]:
     node: Mapping[str, Any] | None = schema
     for step in location:
         node = _child(schema, node, step)
-    return _resolved(schema, node)
+    return _of_kind(schema, node, "object")
 
 
 def _resolved(schema: Mapping[str, Any], node: Mapping[str, Any] | None) -> Mapping[str, Any]:
@@ -152,10 +154,17 @@ def _resolved(schema: Mapping[str, Any], node: Mapping[str, Any] | None) -> Mapp
     return node or {}
 
 
+def _of_kind(schema: Mapping[str, Any], node: Mapping[str, Any] | None, kind: str) -> Mapping[str, Any]:
+    """The node, or of several kinds of value that it allows the one of this type."""
+    node = _resolved(schema, node)
+    choices = [_resolved(schema, choice) for choice in node.get("oneOf", [])]
+    return next((choice for choice in choices if choice.get("type") == kind), node)
+
+
 def _child(
     schema: Mapping[str, Any], node: Mapping[str, Any] | None, step: str | int
 ) -> Mapping[str, Any] | None:
-    node = _resolved(schema, node)
+    node = _of_kind(schema, node, "array" if isinstance(step, int) else "object")
     if isinstance(step, int):
         fixed = node.get("prefixItems", [])
         return fixed[step] if step < len(fixed) else node.get("items")
@@ -167,9 +176,13 @@ _BOUNDS = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "m
 
 def _in_words(schema: Mapping[str, Any], node: Mapping[str, Any] | None) -> str:
     node = _resolved(schema, node)
+    if "oneOf" in node:  # a value of several kinds
+        return " or ".join(_in_words(schema, kind) for kind in node["oneOf"])
     if "enum" in node:
         return "one of " + ", ".join(repr(choice) for choice in node["enum"])
     match node.get("type"):
+        case "boolean":
+            return "true or false"
         case "number" | "integer" as kind:
             bounds = [f"{sign} {node[key]:g}" for key, sign in _BOUNDS.items() if key in node]
             return " ".join(["a number" if kind == "number" else "an integer", " and ".join(bounds)]).strip()

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from fem import Inclusion
 from fem.model import MAX_SAG, MAX_SLENDERNESS
 from scenes.sensor import conflicts as optical_conflicts
+from scenes.spectrum import longest
 from twin.complaint import DesignError, shown
 
 if TYPE_CHECKING:
@@ -41,7 +42,8 @@ def design_conflicts(design: Design) -> Iterator[DesignError]:
         allowed = f"at most {MAX_SLENDERNESS:g} times its thickness, {widest:g} mm (else the mesh is coarse)"
         yield DesignError("specimen.width_mm", shown(slab.width_mm), allowed)
     yield from _dome_conflicts(design)
-    for conflict in optical_conflicts(design.guide(), design.leds, design.camera, design.surface):
+    redmost = design.guide(longest(design.leds, design.light.wavelength_nm))  # where the index is lowest
+    for conflict in optical_conflicts(redmost, design.leds, design.camera, design.surface, design.glass):
         field = conflict.field.replace("skin.", "surface.")
         yield DesignError(field, shown(conflict.received), conflict.allowed)
     if slab.width_mm < design.waveguide.width_mm:

@@ -14,6 +14,7 @@ from matplotlib.tri import LinearTriInterpolator, Triangulation
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
+from twin.frame import grey
 from twin.panels import FAINT, INCLUSION, INK, INNER, LED, ROUND, Pictured, quads, scale_bar, triangles
 
 TISSUE, GLASS, WALL, PRESSURE = "#f3ddcf", "#d5e8df", "#d0d0d0", "#2b6ca3"
@@ -178,7 +179,7 @@ def draw_profiles(rows: Sequence[Axes], frame: Pictured, letter: str) -> None:
     rows[1].set_ylabel("pressure\nkPa", fontsize=6.5)
     rows[1].legend(fontsize=6, frameon=False, loc="best", ncols=2, handlelength=2.2, borderpad=0)
 
-    counts = np.asarray(frame.tared, np.float64)
+    counts = grey(frame.tared)
     row = round((0.5 - y / camera.field_height_mm) * counts.shape[0])  # rows grow with -y
     band = counts[max(row - 8, 0) : row + 9].mean(axis=0)
     columns = ((np.arange(counts.shape[1]) + 0.5) / counts.shape[1] - 0.5) * camera.field_of_view_mm

@@ -12,7 +12,6 @@ import tomllib
 from collections.abc import Iterable
 from dataclasses import replace
 from importlib.resources import files
-from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -22,6 +21,8 @@ from pydantic.json_schema import GenerateJsonSchema
 
 import fem
 from fem.model import DomeRadius, Length, Modulus, Offset, Poisson, Sides, Tilt
+from scenes import dispersion, ies
+from scenes.led import Light
 from scenes.sensor import Camera, Glass, Guide, Led, Sensor, Walls
 from scenes.skin import Absorption, Anisotropy, RefractiveIndex, Scattering, Skin, Tissue
 from twin.complaint import DesignError, from_validation, not_finite, shown
@@ -52,8 +53,12 @@ class Waveguide:
         Field(min_length=1, max_length=16, description="Elastic layers, from the contact side."),
     ]
     refractive_index: Annotated[
-        RefractiveIndex, Field(description="Refractive index of all layers at the light's wavelength.")
-    ] = 1.4336
+        RefractiveIndex | None,
+        Field(
+            description="Refractive index of all layers, the same for all light; that of Sylgard 184, which "
+            "falls with the wavelength, if left out."
+        ),
+    ] = None
     absorption_per_mm: Annotated[
         Absorption, Field(description="Absorption coefficient of all layers, 1/mm (PDMS: about 0.001).")
     ] = 0.0
@@ -76,15 +81,6 @@ class Waveguide:
     def thickness_mm(self) -> float:
         """Thickness of all layers together, mm."""
         return sum(layer.thickness_mm for layer in self.layers)
-
-
-@dataclass(frozen=True, config=CONFIG)
-class Light:
-    """The light of the LEDs."""
-
-    wavelength_nm: Annotated[
-        float, Field(ge=350.0, le=1100.0, description="Wavelength of the light, nm.")
-    ] = 550.0
 
 
 @dataclass(frozen=True, config=CONFIG)
@@ -229,13 +225,14 @@ class Design:
         except ValidationError as error:
             raise from_validation(error, given, design_schema()) from None
 
-    def guide(self) -> Guide:
-        """Return the waveguide as light sees it."""
-        waveguide = self.waveguide
+    def guide(self, wavelength_nm: float | None = None) -> Guide:
+        """Return the waveguide as light of a wavelength sees it, by default that of `light`."""
+        waveguide, index = self.waveguide, self.waveguide.refractive_index
+        index = index or dispersion.pdms(wavelength_nm or self.light.wavelength_nm)
         return Guide(
             width_mm=waveguide.width_mm,
             thickness_mm=waveguide.thickness_mm,
-            refractive_index=waveguide.refractive_index,
+            refractive_index=index,
             absorption_per_mm=waveguide.absorption_per_mm,
             walls=waveguide.walls,
             wall_albedo=waveguide.wall_albedo,
@@ -246,17 +243,18 @@ class Design:
         slab = self.specimen
         return Tissue(slab.refractive_index, slab.scattering_per_mm, slab.absorption_per_mm, slab.anisotropy)
 
-    def sensor(self) -> Sensor:
-        """Return the whole sensor as light sees it."""
+    def sensor(self, wavelength_nm: float | None = None) -> Sensor:
+        """Return the whole sensor as light of a wavelength sees it, by default that of `light`."""
+        wavelength = wavelength_nm or self.light.wavelength_nm
         return Sensor(
-            guide=self.guide(),
-            glass=self.glass,
+            guide=self.guide(wavelength),
+            glass=self.glass.at(wavelength),
             leds=self.leds,
             camera=self.camera,
             skin=self.surface,
             tissue=self.tissue(),
             effective_modulus_kPa=self.effective_modulus_kPa,
-            wavelength_nm=self.light.wavelength_nm,
+            wavelength_nm=wavelength,
         )
 
     @property
@@ -338,7 +336,7 @@ def load_design(name_or_path: str | Path) -> Design:
     source = str(name_or_path)
     text = _read(name_or_path)
     try:
-        return parse_design(tomllib.loads(text), source)
+        return parse_design(ies.beside(tomllib.loads(text), _place(name_or_path).parent), source)
     except tomllib.TOMLDecodeError as error:
         message, _, place = str(error).rpartition(" (at ")
         raise DesignError(
@@ -370,15 +368,22 @@ def parse_design(data: dict[str, Any], source: str = "") -> Design:
         raise from_validation(error, data, schema).renamed(source=source) from None
 
 
+def _place(name_or_path: str | Path) -> Path:
+    """Return the file of a shipped design, or the path itself."""
+    source = str(name_or_path)
+    return (
+        Path(str(files("assets").joinpath("designs", f"{source}.toml")))
+        if source in shipped_designs()
+        else Path(source)
+    )
+
+
 def _read(name_or_path: str | Path) -> str:
     source = str(name_or_path)
     if not source:
         raise DesignError("DESIGN", "an empty name", "a shipped design or a TOML file")
-    place: Traversable | Path = Path(source)
-    if source in shipped_designs():
-        place = files("assets").joinpath("designs", f"{source}.toml")
     try:
-        return place.read_text(encoding="utf-8-sig")  # Windows editors put a mark first
+        return _place(name_or_path).read_text(encoding="utf-8-sig")  # Windows editors put a mark first
     except UnicodeDecodeError:
         raise DesignError("the file", "bytes that are not UTF-8 text", "a TOML file", source=source) from None
     except IsADirectoryError:

@@ -19,6 +19,7 @@ from scenes.sensor import NotModelled
 from twin import presses
 from twin.complaint import DesignError
 from twin.design import Design
+from twin.frame import grey
 from twin.simulation import Device, saturated_percent
 
 if TYPE_CHECKING:
@@ -155,9 +156,9 @@ def check_up(
     design.check_indentation(depth)
     tell = progress or (lambda stage, done: None)
     tell("setting up", 0.0)
-    from scenes import Renderer
+    from scenes import SpectralRenderer
 
-    renderer = Renderer(design.sensor(), device=device)
+    renderer = SpectralRenderer(design.sensor(), count=design.light.bands, at=design.sensor, device=device)
     failures: list[str] = []
     tell("mechanics", 0.15)
     press, has_inclusion = _press(design, depth, failures)
@@ -197,13 +198,16 @@ def check_up(
         background = balanced(hovering)
     lit = blank or background
     tell("sample paths", 0.75)
-    recorded = paths.from_leds(renderer.scene, renderer.sensor, renderer.table, _SAMPLE_PATHS, seed)
+    whole = renderer.whole
+    if whole not in renderer.renderers:  # its surface is still untouched
+        whole.render(followed, field="pressure_0" if followed is not hovering else "pressure", samples=2)
+    recorded = paths.from_leds(whole.scene, whole.sensor, whole.table, _SAMPLE_PATHS, seed)
     shape = surface.resample(
         followed, design.waveguide.width_mm, suffix="_0" if followed is not hovering else "", nodes=65
     )
     tell("camera", 0.9)
     found = _signal(design, standard, blank, seed) if standard and blank else None
-    in_sight = 100.0 * paths.in_sight(renderer.scene, renderer.sensor, renderer.rays)
+    in_sight = 100.0 * paths.in_sight(whole.scene, whole.sensor, whole.rays)
     checkup = Checkup(
         design=design,
         indentation_mm=depth,
@@ -278,7 +282,7 @@ def _off(rendering: Rendering, emitted: Array) -> Array:
 def _first(design: Design, rendering: Rendering, paths: Paths, emitted: Array) -> dict[str, Array]:
     """First events: the trapped share from all light paths, the rest from the recorded ones."""
     assert rendering.trapped is not None
-    guide = design.waveguide.refractive_index
+    guide = design.guide().refractive_index
     critical = np.sqrt(max(1.0 - (design.surface.gap_index / guide) ** 2, 0.0))
     n_led = emitted.size
 
@@ -298,35 +302,36 @@ def _detected(design: Design, rendering: Rendering, emitted: Array) -> Array:
     from scenes.camera import irradiance
 
     camera = design.camera
-    area_m2 = camera.pixel_um[0] * camera.pixel_um[1] * 1e-12
-    flux = [irradiance(camera, layer.astype(np.float64)).sum() * area_m2 for layer in rendering.radiance]
+    area_m2 = camera.pitch_mm[0] * camera.pitch_mm[1] * 1e-6
+    flux = [grey(irradiance(camera, layer)).sum() * area_m2 for layer in rendering.radiance]
     return _percent(np.array(flux), emitted)
 
 
 def _shares(rendering: Rendering) -> Array:
-    light = rendering.radiance.sum(axis=(1, 2), dtype=np.float64)
+    light = np.array([layer.sum(dtype=np.float64) for layer in rendering.radiance])
     return np.asarray(100.0 * light / max(float(light.sum()), 1e-300))
 
 
-def _total(rendering: Rendering) -> Array:
-    return np.asarray(rendering.radiance.sum(axis=0, dtype=np.float64))
+def _total(design: Design, rendering: Rendering) -> Array:
+    """What the lens lets through to the pixels, all LEDs together."""
+    from scenes.lens import through
+
+    return through(design.sensor(), rendering.radiance.sum(axis=0, dtype=np.float64))
 
 
 def _uniformity(rendering: Rendering) -> float:
-    low, high = np.percentile(_total(rendering), [1.0, 99.0])
+    low, high = np.percentile(grey(rendering.radiance.sum(axis=0, dtype=np.float64)), [1.0, 99.0])
     return float(high / low) if low > 0 else float("inf") if high > 0 else 1.0
 
 
 def _exposure(design: Design, rendering: Rendering, seed: int) -> Exposure:
     from scenes.camera import expose, mean_counts
 
-    radiance, wavelength = _total(rendering), design.light.wavelength_nm
+    radiance, wavelength = _total(design, rendering), design.light.wavelength_nm
     mean = mean_counts(design.camera, radiance, wavelength)
     image = expose(design.camera, radiance, wavelength, np.random.default_rng(seed))
     mean = np.minimum(mean, 2**design.camera.bits - 1)
-    return Exposure(
-        float(mean.max()), float(mean.mean()), saturated_percent(design, image, rendering.radiance)
-    )
+    return Exposure(float(mean.max()), float(mean.mean()), saturated_percent(design, image, radiance))
 
 
 def _advised(design: Design, rendering: Rendering, in_sight: Array) -> float | None:
@@ -334,12 +339,14 @@ def _advised(design: Design, rendering: Rendering, in_sight: Array) -> float | N
     from scenes.camera import mean_electrons
 
     camera = design.camera
-    electrons = mean_electrons(camera, _total(rendering), design.light.wavelength_nm)
+    electrons = mean_electrons(camera, _total(design, rendering), design.light.wavelength_nm)
     spared = min(_BRIGHTEST + _SPOTS * float(in_sight.sum()), 50.0)
     bright = float(np.percentile(electrons, 100.0 - spared))
     if bright <= 0.0:
         return None
-    top = min((2**camera.bits - 1 - camera.offset_dn) * camera.gain_e_per_dn, camera.full_well_e)
+    top = min(
+        (2**camera.bits - 1 - camera.offset_dn) * camera.gain_e_per_dn, camera.full_well_e * camera.binning**2
+    )
     wanted = camera.exposure_ms * FILL * top / bright
     return float(np.clip(float(f"{wanted:.2g}"), 1e-3, 1e5))
 
@@ -349,10 +356,11 @@ def _signal(design: Design, standard: Rendering, blank: Rendering, seed: int) ->
     from scenes.camera import expose, mean_counts
 
     camera, wavelength = design.camera, design.light.wavelength_nm
-    lit, unlit = _total(standard), _total(blank)
+    lit, unlit = _total(design, standard), _total(design, blank)
     top = 2**camera.bits - 1
     tared = np.minimum(mean_counts(camera, lit, wavelength), top)
     tared -= np.minimum(mean_counts(camera, unlit, wavelength), top)
+    tared = grey(tared)
     # where half a millimetre is brightest: the brightest pixels alone would be the light's Monte Carlo noise
     pixel = camera.field_of_view_mm / camera.columns, camera.field_height_mm / camera.rows
     window = [max(round(_PLACE_MM / pixel[1]), 1), max(round(_PLACE_MM / pixel[0]), 1)]
@@ -362,9 +370,7 @@ def _signal(design: Design, standard: Rendering, blank: Rendering, seed: int) ->
     rows = slice(max(row - _NOISE_REACH, 0), row + _NOISE_REACH + 1)
     columns = slice(max(column - _NOISE_REACH, 0), column + _NOISE_REACH + 1)
     near = (rows, columns)
-    frames = np.stack(
-        [expose(camera, lit, wavelength, rng)[near].astype(np.float64) for _ in range(_NOISE_FRAMES)]
-    )
+    frames = np.stack([grey(expose(camera, lit, wavelength, rng)[near]) for _ in range(_NOISE_FRAMES)])
     noise = float(np.sqrt(np.mean(np.var(frames, axis=0, ddof=1))))
     # a saturated pixel does not stir; the converter's step is always there
     return Signal(float(counts), max(noise, 1.0 / np.sqrt(12.0)), (int(row), int(column)))

@@ -165,7 +165,7 @@ def _rim(checkup: Checkup) -> Iterator[Finding]:
         return
     for number, led in enumerate(checkup.design.leds):
         top = led.z_mm + led.diameter_mm / 2
-        if top > checkup.rim_mm:
+        if top > checkup.rim_mm and led.side != "below":
             yield Finding(
                 "error",
                 f"leds.{number}.z_mm",
@@ -178,7 +178,7 @@ def _rim(checkup: Checkup) -> Iterator[Finding]:
 
 def _indices(checkup: Checkup) -> Iterator[Finding]:
     design = checkup.design
-    n, gap = design.waveguide.refractive_index, design.surface.gap_index
+    n, gap = design.guide().refractive_index, design.surface.gap_index
     sheet = design.surface.sheet
     behind, field = (sheet, "surface.sheet") if sheet else (design.specimen, "specimen")
     tissue = behind.refractive_index

@@ -26,7 +26,15 @@ if TYPE_CHECKING:
     import pyvista
 
 RECORD = "frame.json"
-PICTURES = ("frame.exr", "image.png", "tared.png", "reference.exr", "reference.png", "overview.png")
+PICTURES = (
+    "frame.exr",
+    "image.png",
+    "image.exr",
+    "tared.png",
+    "reference.exr",
+    "reference.png",
+    "overview.png",
+)
 FILES = frozenset({RECORD, "surface.vtp", *PICTURES})
 
 _PACKAGES = (
@@ -54,11 +62,14 @@ class Frame:
     ``position_mm`` on it and its ``tilt_deg``, [x, y] each."""
     seed: int
     image: NDArray[Any]
-    """(rows, columns) counts, uint8, or uint16 above 8 bits."""
+    """(rows, columns) counts, (rows, columns, 3) in colour: uint8, or uint16 above 8 bits; float32, the mean,
+    where the camera averages frames."""
     reference: NDArray[np.float32]
-    """(rows, columns) counts: mean of 16 noisy frames of the same press without inclusion."""
+    """(rows, columns[, 3]) counts: mean of 16 noisy frames, or of as many as `image` if that is more, of the
+    same press without inclusion."""
     radiance: NDArray[np.float32]
-    """(n_led, rows, columns) W m⁻² sr⁻¹, one layer per LED, at the camera's lens."""
+    """(n_led, rows, columns[, 3]) W m⁻² sr⁻¹, one layer per LED, at the camera's lens, summed over
+    wavelengths against the camera's response (see `scenes.spectrum`)."""
     pressure: NDArray[np.float32]
     """(rows, columns) contact pressure that each pixel looks at, kPa."""
     displacement_z: NDArray[np.float32]
@@ -75,7 +86,7 @@ class Frame:
 
     @property
     def tared(self) -> NDArray[np.float32]:
-        """(rows, columns) counts of the picture minus those of the reference; negative ones too."""
+        """(rows, columns[, 3]) counts of the picture minus those of the reference; negative ones too."""
         return self.image.astype(np.float32) - self.reference
 
     def record(self) -> dict[str, Any]:
@@ -87,6 +98,7 @@ class Frame:
         return {
             "inclusion": inclusion,
             "press": self.press,
+            "lens": _lens(self.design),
             "fem": self.fem,
             "tsis": self.tsis,
             "design": self.design.name,
@@ -97,6 +109,25 @@ class Frame:
     def write(self, out: str | Path) -> Path:
         """Write the frame's files into a new folder, or in place of an earlier frame; see `write_frames`."""
         return write_frames([self], out)
+
+
+def grey(picture: NDArray[Any]) -> NDArray[np.float64]:
+    """Return counts as (rows, columns): those of a picture without colour, or the mean of R, G and B."""
+    counts = np.asarray(picture, np.float64)
+    return counts if counts.ndim == 2 else counts.mean(axis=2)
+
+
+def _lens(design: Design) -> dict[str, float]:
+    """Return the lens that the camera's geometry asks for, as `frame.json` names it."""
+    from scenes.lens import lens_of
+
+    lens, (pitch, _) = lens_of(design.sensor()), design.camera.pitch_mm
+    return {
+        "focal_length_mm": lens.focal_mm,
+        "pupil_mm": lens.pupil_mm,
+        "magnification": lens.magnification,
+        "blur_px": lens.blur_mm / pitch,
+    }
 
 
 def versions() -> dict[str, str]:
@@ -146,17 +177,20 @@ def _holds_one_frame(folder: Path) -> bool:
 
 def _write(frame: Frame, folder: Path) -> None:
     # Slow to import, and a look at `twin --help` needs none of them.
-    from scenes.camera import tare
+    from scenes.camera import count_dtype, tare
     from scenes.exr import write_exr, write_png
     from twin.pictures import overview
 
-    layers = {f"led.{number}": layer for number, layer in enumerate(frame.radiance)}
+    layers = _planes({f"led.{number}": layer for number, layer in enumerate(frame.radiance)})
     fields = {"pressure": frame.pressure, "displacement.z": frame.displacement_z}
     units = {"pressure": "kPa", "displacement.z": "mm", **dict.fromkeys(layers, "W m-2 sr-1")}
     write_exr(folder / "frame.exr", {**layers, **fields}, {f"unit.{name}": units[name] for name in units})
-    write_exr(folder / "reference.exr", {"counts": frame.reference}, {"unit.counts": "DN"})
-    write_png(folder / "image.png", frame.image)
-    write_png(folder / "reference.png", np.rint(frame.reference).astype(frame.image.dtype))
+    whole = count_dtype(frame.design.camera.bits)
+    for name, counts in (("image", frame.image), ("reference", frame.reference)):
+        if counts.dtype == np.float32:
+            planes = _planes({"counts": counts})
+            write_exr(folder / f"{name}.exr", planes, {f"unit.{plane}": "DN" for plane in planes})
+        write_png(folder / f"{name}.png", np.rint(counts).astype(whole))
     write_png(folder / "tared.png", tare(frame.image, frame.reference, frame.design.camera.bits))
     frame.surface.save(folder / "surface.vtp")
     overview(frame, folder / "overview.png")
@@ -164,6 +198,17 @@ def _write(frame: Frame, folder: Path) -> None:
     record["sha256"] = {path.name: _sha256(path) for path in sorted(folder.iterdir())}
     text = json.dumps(record, indent=2, allow_nan=False, ensure_ascii=False, default=np.generic.item)
     (folder / RECORD).write_text(text + "\n", encoding="utf-8")
+
+
+def _planes(layers: dict[str, NDArray[np.float32]]) -> dict[str, NDArray[np.float32]]:
+    """Return layers of colour, (rows, columns, 3), as NAME.R, NAME.G and NAME.B; others as they are."""
+    return {
+        f"{name}.{channel}" if channel else name: np.ascontiguousarray(plane)
+        for name, layer in layers.items()
+        for channel, plane in (
+            zip("RGB", np.moveaxis(layer, 2, 0), strict=True) if layer.ndim == 3 else [("", layer)]
+        )
+    }
 
 
 def _sha256(path: Path) -> str:

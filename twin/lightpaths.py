@@ -128,7 +128,7 @@ def _draw_side(axes: Axes, checkup: Checkup, axis: str) -> None:
     )
     for sign in (-1, 1):  # the black frame about the glass
         axes.plot([sign * half] * 2, [lowest, bottom], color="black", lw=2, solid_capstyle="butt", zorder=4)
-    shown = [k for k, led in enumerate(design.leds) if led.side[-1] == axis or _is_below(led)]
+    shown = [k for k, led in enumerate(design.leds) if led.side[-1] == axis or led.side == "below"]
     _draw_paths(axes, checkup, (across, 2), shown)
     for number in shown:
         _led_from_the_side(axes, checkup, number, across)
@@ -147,11 +147,15 @@ def _draw_side(axes: Axes, checkup: Checkup, axis: str) -> None:
 
 
 def _led_from_the_side(axes: Axes, checkup: Checkup, number: int, across: int) -> None:
-    led: Any = checkup.design.leds[number]
+    led = checkup.design.leds[number]
     half = checkup.design.waveguide.width_mm / 2
-    if _is_below(led):
-        corner = ((led.x_mm, led.y_mm)[across] - led.diameter_mm / 2, led.z_mm - 0.8)
-        axes.add_patch(Rectangle(corner, led.diameter_mm, 0.8, facecolor=LED, edgecolor=INK, lw=0.5))
+    if led.side == "below":
+        floor = -checkup.design.waveguide.thickness_mm - checkup.design.glass.thickness_mm
+        top = floor + (-led.gap_mm if led.coupling == "air" else led.gap_mm)
+        corner = ((led.x_mm, led.y_mm)[across] - led.diameter_mm / 2, top - 0.8)
+        axes.add_patch(
+            Rectangle(corner, led.diameter_mm, 0.8, facecolor=LED, edgecolor=INK, lw=0.5, zorder=15)
+        )
         return
     sign = 1 if led.side[0] == "+" else -1
     face = half + (led.gap_mm if led.coupling == "air" else -led.gap_mm)
@@ -168,11 +172,6 @@ def _led_from_the_side(axes: Axes, checkup: Checkup, number: int, across: int) -
     where = sign * (face + 1.1)
     text = f"led {number}"
     axes.text(where, led.z_mm, text, fontsize=6.5, va="center", ha="left" if sign > 0 else "right", zorder=20)
-
-
-def _is_below(led: Any) -> bool:
-    """Whether an LED shines from underneath."""
-    return str(led.side) == "below"
 
 
 def _draw_camera(axes: Axes, checkup: Checkup, across: int, lowest: float) -> None:
@@ -231,9 +230,8 @@ def _draw_above(axes: Axes, checkup: Checkup) -> None:
             zorder=16,
         )
     )
-    led: Any
     for number, led in enumerate(design.leds):
-        if _is_below(led):
+        if led.side == "below":
             axes.add_patch(Circle((led.x_mm, led.y_mm), led.diameter_mm / 2, facecolor=LED, zorder=15))
             continue
         sign, along = (1 if led.side[0] == "+" else -1), _SIDES[led.side[-1]]

@@ -17,6 +17,8 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, zoom
 
+from twin.frame import grey
+
 if TYPE_CHECKING:
     import pyvista as pv
 
@@ -41,11 +43,11 @@ class Pictured(Protocol):
     @property
     def seed(self) -> int: ...
     @property
-    def image(self) -> NDArray[Any]: ...  # counts
+    def image(self) -> NDArray[Any]: ...  # counts, (rows, columns[, 3])
     @property
     def tared(self) -> NDArray[Any]: ...  # signed counts
     @property
-    def radiance(self) -> NDArray[Any]: ...  # (n_led, rows, columns) W m-2 sr-1
+    def radiance(self) -> NDArray[Any]: ...  # (n_led, rows, columns[, 3]) W m-2 sr-1
     @property
     def surface(self) -> pv.PolyData: ...
     @property
@@ -106,7 +108,7 @@ def draw_pressure(axes: Axes, frame: Pictured, letter: str) -> None:
 
 def draw_radiance(axes: Axes, frame: Pictured, letter: str) -> None:
     """Radiance at the lens, all LEDs together, false colour spanning the middle of the picture."""
-    total = np.asarray(frame.radiance, np.float64).sum(axis=0)
+    total = grey(np.asarray(frame.radiance, np.float64).sum(axis=0))
     rows, columns = total.shape
     inner = total[rows // 8 : rows - rows // 8, columns // 8 : columns - columns // 8]
     low, high = max(float(inner.min()), 0.0), max(float(inner.max()), 0.0)
@@ -132,17 +134,20 @@ def draw_counts(axes: Axes, frame: Pictured, letter: str) -> None:
     """The picture as the camera delivers it: black is 0, white the converter's last count."""
     bits, image = frame.design.camera.bits, np.asarray(frame.image)
     extent = _extent(frame)
-    drawn = axes.imshow(image, cmap="gray", extent=extent, interpolation="nearest", vmin=0, vmax=2**bits - 1)
-    _colour_bar(axes, drawn, "counts")
+    top = 2**bits - 1
+    shown = image if image.ndim == 2 else image / top  # three channels are drawn from 0 to 1
+    drawn = axes.imshow(shown, cmap="gray", extent=extent, interpolation="nearest", vmin=0, vmax=top)
+    if image.ndim == 2:
+        _colour_bar(axes, drawn, "counts")
     scale_bar(axes, extent[0] + 1, extent[2] + 1, 5.0, "white" if image.mean() < 2 ** (bits - 1) else INK)
     axes.set_xticks([])
     axes.set_yticks([])
-    axes.set_title(f"{letter}  Picture, {bits} bit, {image.min()} to {image.max()} counts")
+    axes.set_title(f"{letter}  Picture, {bits} bit, {image.min():.5g} to {image.max():.5g} counts")
 
 
 def draw_tared(axes: Axes, frame: Pictured, letter: str) -> None:
     """Picture minus its reference; noise alone stays pale, because the colours span twice the threshold."""
-    counts, k, extent = np.asarray(frame.tared, np.float64), frame.design.signal.counts, _extent(frame)
+    counts, k, extent = grey(frame.tared), frame.design.signal.counts, _extent(frame)
     limit = max(2.0 * k, float(np.quantile(np.abs(counts), 0.9995)))
     drawn = axes.imshow(
         counts, cmap="RdBu_r", extent=extent, interpolation="nearest", vmin=-limit, vmax=limit
@@ -167,7 +172,7 @@ def draw_tared(axes: Axes, frame: Pictured, letter: str) -> None:
 def draw_relief(axes: Any, frame: Pictured) -> None:
     """Tared picture as a landscape, as in Fig. 3(c) of the source paper (key ``lee2011``)."""
     extent = _extent(frame)
-    counts = gaussian_filter(np.asarray(frame.tared, np.float64), 5.0)
+    counts = gaussian_filter(grey(frame.tared), 5.0)
     small = zoom(counts, (64 / counts.shape[0], 96 / counts.shape[1]), order=1)
     x = np.linspace(extent[0], extent[1], small.shape[1])
     y = np.linspace(extent[3], extent[2], small.shape[0])
@@ -219,6 +224,10 @@ def _led_marks(axes: Axes, frame: Pictured) -> None:
     left, right, low, high = _extent(frame)
     beyond, marks = False, []
     for led in frame.design.leds:
+        if led.side == "below":
+            place = np.clip(led.x_mm, left, right), np.clip(led.y_mm, low, high)
+            marks += axes.plot(*place, "o", ms=6, color=LED, mec=INK, mew=0.5, clip_on=False, zorder=5)
+            continue
         along, face = led.along_mm, frame.design.waveguide.width_mm / 2
         away = face + (led.gap_mm if led.coupling == "air" else -led.gap_mm)
         x, y, mark = {

@@ -16,12 +16,12 @@ from estimation import scalars
 from twin import presses
 from twin.complaint import DesignError, shown
 from twin.design import Design, load_design
-from twin.frame import Frame
+from twin.frame import Frame, grey
 from twin.presses import Mechanics, Quality
 
 if TYPE_CHECKING:
     from fem import Press
-    from scenes import Renderer, Rendering
+    from scenes import Rendering, SpectralRenderer
 
 Device = Literal["auto", "cpu", "cuda"]
 Progress = Callable[[str, float], None]
@@ -126,9 +126,9 @@ def simulate(
     levels, by_force, several = presses.levels_of(design, indentation, force)
     check(design, inclusion, levels, by_force=by_force)
     seed = _seed(seed)
-    from scenes import Renderer
+    from scenes import SpectralRenderer
 
-    renderer = Renderer(design.sensor(), device=device)
+    renderer = SpectralRenderer(design.sensor(), count=design.light.bands, at=design.sensor, device=device)
     work = _Work(progress or (lambda stage, done: None), len(levels), _seconds(design, len(levels)))
     pressed = presses.solved(
         design,
@@ -180,14 +180,17 @@ def _frame(
     design: Design,
     inclusion: fem.Inclusion | None,
     press: Press,
-    renderer: Renderer,
+    renderer: SpectralRenderer,
     quality: Quality,
     seed: int,
     level: float,
     tell: Callable[[float], None],
 ) -> Frame:
+    from scenes.lens import through
+
     start = time.perf_counter()
     camera, wavelength, k = design.camera, design.light.wavelength_nm, design.signal.counts
+    sensor = renderer.sensor
     # The same with and without the inclusion, so that their noise cancels; 26 bits leave room for the LEDs.
     light = int(_random(seed, _LIGHT).generate_state(1)[0]) >> 6
 
@@ -200,18 +203,19 @@ def _frame(
             progress=lambda share: tell(before + 0.5 * share),
         )
 
+    def received(rendering: Rendering) -> np.ndarray:
+        return through(sensor, rendering.radiance.sum(axis=0, dtype=np.float64))
+
     def expose(rendering: Rendering, purpose: int, frames: int) -> np.ndarray:
         from scenes.camera import expose
 
         rng = np.random.Generator(np.random.PCG64(_random(seed, purpose, round(level * 1e6))))
-        return expose(
-            camera, rendering.radiance.sum(axis=0, dtype=np.float64), wavelength, rng, frames=frames
-        )
+        return expose(camera, received(rendering), wavelength, rng, frames=frames)
 
     lit = render("pressure", 0.0)
     unlit = render("pressure_0", 0.5) if inclusion is not None else lit
-    image = expose(lit, _PICTURE, 1)
-    reference = expose(unlit, _REFERENCE, REFERENCE_FRAMES).astype(np.float32)
+    image = expose(lit, _PICTURE, camera.frames)
+    reference = expose(unlit, _REFERENCE, max(REFERENCE_FRAMES, camera.frames)).astype(np.float32)
     tell(1.0)
     return Frame(
         design=design,
@@ -236,11 +240,11 @@ def _frame(
             "seconds": press.seconds,
         },
         tsis={
-            "raw": scalars(image, k),
-            "tared": scalars(image.astype(np.float64) - reference, k),
+            "raw": scalars(grey(image), k),
+            "tared": scalars(grey(image) - grey(reference), k),
             "seconds": time.perf_counter() - start,
             "noise_percent": lit.noise_percent,
-            "saturated_percent": saturated_percent(design, image, lit.radiance),
+            "saturated_percent": saturated_percent(design, image, received(lit)),
         },
     )
 
@@ -258,13 +262,13 @@ def _how(design: Design, press: Press) -> dict[str, Any]:
 def saturated_percent(design: Design, image: np.ndarray, radiance: np.ndarray) -> float:
     """Return the share of pixels at the converter's last count or at the full well, per cent.
 
-    ``image`` is (rows, columns) counts, ``radiance`` (n_led, rows, columns) W m⁻² sr⁻¹.
+    ``image`` is (rows, columns[, 3]) counts, ``radiance`` the same of what the lens lets through, W m⁻² sr⁻¹.
     """
     from scenes.camera import mean_counts
 
     camera = design.camera
-    well = camera.offset_dn + camera.full_well_e / camera.gain_e_per_dn
-    mean = mean_counts(camera, radiance.sum(axis=0, dtype=np.float64), design.light.wavelength_nm)
+    well = camera.offset_dn + camera.full_well_e * camera.binning**2 / camera.gain_e_per_dn
+    mean = mean_counts(camera, radiance, design.light.wavelength_nm)
     full = (image >= 2**camera.bits - 1) | (mean >= well * (1 - 1e-12))
     return 100.0 * float(full.mean())
 

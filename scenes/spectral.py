@@ -1,0 +1,152 @@
+"""Pictures in light of many wavelengths: one `Renderer` for each, summed against the camera's response."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .render import PATHS_PER_LED, Quality, Renderer, Rendering
+from .sensor import Led, NotModelled, Sensor
+from .spectrum import Band, bands
+
+if TYPE_CHECKING:
+    import pyvista as pv
+
+_SEEDS = 2**26  # as many as a renderer keeps apart
+_SEED_STEP = 0x9E3779B1  # bands far apart, whichever number the caller chose
+
+
+class SpectralRenderer:
+    """A sensor's scene at every wavelength that its LEDs and its camera ask for."""
+
+    def __init__(
+        self,
+        sensor: Sensor,
+        *,
+        count: int = 3,
+        at: Callable[[float], Sensor] | None = None,
+        device: str = "auto",
+    ) -> None:
+        """Load the scenes on `device` ("auto", "cpu" or "cuda"; see `backend.use`).
+
+        Parameters
+        ----------
+        sensor
+            At the wavelength that the sum is given as; its LEDs tell their spectra.
+        count
+            Number of bands of a spectrum that is no line.
+        at
+            The sensor at another wavelength, nm; without it the indices stay the same.
+        """
+        self.sensor, self._device = sensor, device
+        self.bands = bands(sensor.leds, sensor.camera, sensor.wavelength_nm, count)
+        self._leds = [_alight(sensor, band) for band in self.bands]
+        self.renderers = []
+        for band, leds in zip(self.bands, self._leds, strict=True):
+            same = band.wavelength_nm == sensor.wavelength_nm
+            there = at(band.wavelength_nm) if at and not same else sensor
+            chosen = tuple(_as_line(there.leds[number], number in band.lit) for number in leds)
+            self.renderers.append(
+                Renderer(replace(there, leds=chosen, wavelength_nm=band.wavelength_nm), device=device)
+            )
+
+    @cached_property
+    def whole(self) -> Renderer:
+        """The sensor with all its LEDs at its one wavelength."""
+        alone = self.renderers[0]
+        return alone if len(self.renderers) == 1 else Renderer(self.sensor, device=self._device)
+
+    def render(
+        self,
+        pressed: pv.PolyData,
+        *,
+        quality: Quality = "standard",
+        seed: int = 0,
+        samples: int | None = None,
+        progress: Callable[[float], None] | None = None,
+        **options: Any,
+    ) -> Rendering:
+        """Return the picture of a pressed contact surface; arguments as of `Renderer.render`.
+
+        `radiance` is (n_led, rows, columns), or (n_led, rows, columns, 3) for a camera of colour, each
+        channel summed against its own response. Samples are shared out among the bands of a spectrum.
+        """
+        start = time.perf_counter()
+        camera = self.sensor.camera
+        planes = () if camera.colour == "mono" else (len(camera.channels),)
+        radiance = np.zeros((len(self.sensor.leds), *camera.shape, *planes))
+        sinks: NDArray[np.float64] | None = None
+        trapped = np.zeros(len(self.sensor.leds))
+        variance, first = 0.0, None
+        for number, (band, leds, renderer) in enumerate(
+            zip(self.bands, self._leds, self.renderers, strict=True)
+        ):
+            whole = samples or PATHS_PER_LED[quality]
+            try:
+                one = renderer.render(
+                    pressed,
+                    quality=quality,
+                    seed=(seed + number * _SEED_STEP) % _SEEDS if number else seed,
+                    samples=samples if band.parts == 1 else max(whole // band.parts, 2),
+                    progress=_part(progress, number, len(self.bands)),
+                    **options,
+                )
+            except NotModelled as refused:  # under the LEDs' numbers in the whole sensor
+                text = re.sub(r"leds\.(\d+)", lambda found: f"leds.{leds[int(found[1])]}", str(refused))  # noqa: B023
+                raise NotModelled(text) from None
+            if len(self.bands) == 1 and not planes and np.all(band.share == 1.0):
+                return one
+            share = band.share[list(leds)]
+            layers = one.radiance.astype(np.float64)
+            if planes:
+                radiance[list(leds)] += layers[..., None] * share[:, None, None, :]
+            else:
+                radiance[list(leds)] += layers * share[:, :1, None]
+            counts = np.tensordot(share.mean(axis=1), layers, 1)
+            variance += (0.01 * one.noise_percent * float(np.mean(counts))) ** 2
+            if one.sinks is not None and one.trapped is not None:
+                if sinks is None:
+                    sinks = np.zeros((len(self.sensor.leds), one.sinks.shape[1]))
+                sinks[list(leds)] += band.energy * one.sinks
+                trapped[list(leds)] += band.energy * one.trapped
+            first = first or one
+        assert first is not None
+        noise = 100.0 * np.sqrt(variance) / max(_mean(radiance), 1e-30)
+        return replace(
+            first,
+            radiance=radiance.astype(np.float32),
+            noise_percent=float(noise),
+            sinks=sinks,
+            trapped=None if sinks is None else trapped,
+            seconds=time.perf_counter() - start,
+        )
+
+
+def _mean(radiance: NDArray[np.float64]) -> float:
+    """Mean of all LEDs together over pixels and channels."""
+    return float(radiance.mean()) * radiance.shape[0]
+
+
+def _alight(sensor: Sensor, band: Band) -> tuple[int, ...]:
+    """The LEDs to put into a band's scene: those that shine, and those that stand in the way of light."""
+    if all(led.coupling == "air" and led.side != "below" for led in sensor.leds):
+        return band.lit or (0,)
+    return tuple(range(len(sensor.leds)))
+
+
+def _as_line(led: Led, lit: bool) -> Led:
+    flux = led.flux_W if lit else 0.0
+    return replace(led, flux_W=flux, flux_lm=None, spectrum="line", peak_nm=None, fwhm_nm=None)
+
+
+def _part(progress: Callable[[float], None] | None, number: int, of: int) -> Callable[[float], None] | None:
+    if progress is None:
+        return None
+    return lambda share: progress((number + share) / of)
