@@ -135,7 +135,7 @@ def _draw_side(axes: Axes, checkup: Checkup, axis: str) -> None:
     _draw_camera(axes, checkup, across, lowest)
     aim: dict[str, Any] = {"fontsize": 7, "zorder": 20, "va": "center"}
     axes.text(-half - 0.6, top - _TISSUE_MM / 2, "tissue", ha="right", **aim)
-    axes.text(half + 1.2, bottom + 1.0, f"guide, n = {guide.refractive_index:g}", **aim)
+    axes.text(half + 1.2, bottom + 1.0, f"guide, n = {design.guide().refractive_index:.4g}", **aim)
     axes.text(half + 1.2, 0.5 * (bottom + lowest), f"glass, n = {glass.refractive_index:g}", **aim)
     axes.set_xlim(-half - _BESIDE_MM, half + _BESIDE_MM + 3)
     axes.set_ylim(lowest - _BELOW_MM, top)
