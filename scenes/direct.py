@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .build import led_frame
-from .irradiance import AngularBasis, weigh
+from .irradiance import AngularBasis
 from .lamp import Patterns
 from .sensor import Sensor
 from .surface import OpticalSurface, heights
@@ -53,7 +53,7 @@ class _Path:
 
 
 def direct(sensor: Sensor, basis: AngularBasis, deformed: OpticalSurface) -> Array:
-    """Weighted irradiance of the two families, (n_led, count, CELLS, CELLS), W/mm².
+    """Weighted irradiance of the two families, (n_led, layers, CELLS, CELLS), W/mm².
 
     From a disc of flux F and area A in a medium of index m, Lambertian or else with its pattern's factor
     (`lamp.Patterns.relative`), the element dA sends F/(pi A m²) dA
@@ -61,10 +61,10 @@ def direct(sensor: Sensor, basis: AngularBasis, deformed: OpticalSurface) -> Arr
     found by Newton's method. Height and slope of the deformed surface at the target are kept; what the other
     LEDs' discs shade is left out.
     """
-    n_led, count = len(sensor.leds), basis.count
+    n_led = len(sensor.leds)
     here = [number for number, led in enumerate(sensor.leds) if led.side != "below" and led.flux_W > 0.0]
     if len(here) < n_led:  # light from below crosses both faces at once: it is traced
-        found = np.zeros((n_led, count, CELLS, CELLS))
+        found = np.zeros((n_led, basis.layers, CELLS, CELLS))
         if here:
             some = replace(sensor, leds=tuple(sensor.leds[number] for number in here))
             found[here] = direct(some, basis, deformed)
@@ -82,7 +82,7 @@ def direct(sensor: Sensor, basis: AngularBasis, deformed: OpticalSurface) -> Arr
     led, point = index // (CELLS * CELLS), index % (CELLS * CELLS)
     here = [dr.gather(mi.Float, values, point) for values in target]
     source = _Source.of(sensor, led)
-    weights = _float(basis.columns.T)
+    weights = basis.weights()
 
     def more(number, straight, mirrored, *total):  # type: ignore[no-untyped-def]
         return number < DISC_POINTS
@@ -91,14 +91,14 @@ def direct(sensor: Sensor, basis: AngularBasis, deformed: OpticalSurface) -> Arr
         on_disc = dr.gather(mi.Point2f, disc, number)
         slopes = []
         for by_glass, begin in ((False, straight), (True, mirrored)):
-            flux, cosine, slope = _arrives(sensor, source, on_disc, here, by_glass, begin)
-            weight = weigh(weights, count, basis.columns.shape[1], cosine, flux > 0.0)
+            flux, (cosine, d_x, d_y), slope = _arrives(sensor, source, on_disc, here, by_glass, begin)
+            weight = weights.at(cosine, d_x, d_y, flux > 0.0)
             total = tuple(sum_ + flux * w for sum_, w in zip(total, weight, strict=True))
             slopes.append(slope)
         return number + 1, *slopes, *total
 
     begin = [_first_guess(sensor, source, here, by_glass) for by_glass in (False, True)]
-    state = (mi.UInt32(0), *begin, *(mi.Float(0.0) for _ in range(count)))
+    state = (mi.UInt32(0), *begin, *(mi.Float(0.0) for _ in range(basis.layers)))
     total = list(dr.while_loop(state, more, add))[3:]
     dr.eval(total)
     coarse = np.stack([np.asarray(layer).reshape(n_led, CELLS, CELLS) for layer in total], axis=1)
@@ -206,9 +206,9 @@ def _arrives(
     here: list[mi.Float],
     by_glass: bool,
     begin: mi.Vector2f,
-) -> tuple[mi.Float, mi.Float, mi.Vector2f]:
-    """Irradiance, W/mm², at the targets from one point of each disc, the cosine of incidence there, and the
-    ray's slopes at the disc, found from those of a point nearby."""
+) -> tuple[mi.Float, tuple[mi.Float, ...], mi.Vector2f]:
+    """Irradiance, W/mm², at the targets from one point of each disc; the cosine of incidence there and the
+    direction along x and y; and the ray's slopes at the disc, found from those of a point nearby."""
     slope_x, slope_y = here[3:]
     guide, glass = sensor.guide, sensor.glass
     half, n, n_glass = guide.width_mm / 2, guide.refractive_index, glass.refractive_index
@@ -248,7 +248,8 @@ def _arrives(
         flux *= source.patterns.relative(source.number, leaving, path.p_y, rises)
     lit &= facing > 0.0
     found = dr.select(lit & dr.isfinite(slope.x + slope.y), slope, begin)
-    return dr.select(lit, flux, 0.0), dr.select(lit, cosine, 1.0), found
+    arriving = tuple(dr.select(lit, value, 1.0) for value in (cosine, d_x, d_y))
+    return dr.select(lit, flux, 0.0), arriving, found
 
 
 def _follow(

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
 
 from .contact import ContactOptics
+from .tissue import Coupling
 
 Array = NDArray[np.float64]
 
@@ -28,37 +29,82 @@ class AngularBasis:
 
     Light arrives spread over angles, so T and the tissue's lobes phi_i cannot be taken out of the integral
     over them; with this form the integral is `count` irradiances, smooth over the surface, whatever the
-    pressure does.
+    pressure does. The same holds for what enters aslant and comes out ahead: skew(cos) T = sum_k
+    skew_rows[:, k] skew_columns[k](cos), counted for each of the two directions along the surface.
     """
 
     rows: Array  # (modes, n_fraction, count)
     columns: Array  # (count, n_cos)
+    skew_rows: Array  # (n_fraction, skews), mm
+    skew_columns: Array  # (skews, n_cos)
 
     @property
-    def count(self) -> int:
-        return self.columns.shape[0]
+    def layers(self) -> int:
+        """Maps that light is counted on: `count` plain ones, `skews` along x and as many along y."""
+        return len(self.columns) + 2 * len(self.skew_columns)
+
+    def weights(self) -> Weights:
+        """The columns on the device."""
+        return Weights(*(_Columns.of(columns) for columns in (self.columns, self.skew_columns)))
 
 
-def angular_basis(optics: ContactOptics, lobes: Array, tolerance: float = 5e-5) -> AngularBasis:
-    """Truncated singular value decomposition, largest error at most `tolerance`; lobes (modes, n_cos) on the
-    table's cosines."""
-    products = (lobes[:, None] * optics.transmittance).reshape(-1, lobes.shape[1])
+@dataclass(frozen=True)
+class _Columns:
+    """Functions of the cosine on uniform nodes over 0..1, on the device."""
+
+    table: mi.Float
+    count: int
+    nodes: int
+
+    @staticmethod
+    def of(columns: Array) -> _Columns:
+        table = np.ascontiguousarray(columns.T, dtype=np.float32).ravel()
+        return _Columns(mi.Float(table if table.size else np.zeros(1, dtype=np.float32)), *columns.shape)
+
+    def at(self, cosine: mi.Float, active: mi.Bool) -> list[mi.Float]:
+        at = dr.clip(cosine, 0.0, 1.0) * (self.nodes - 1)
+        node = dr.minimum(mi.UInt32(at), self.nodes - 2)
+        share = at - mi.Float(node)
+        start = node * self.count
+        low = [dr.gather(mi.Float, self.table, start + k, active) for k in range(self.count)]
+        high = [dr.gather(mi.Float, self.table, start + self.count + k, active) for k in range(self.count)]
+        return [dr.lerp(a, b, share) for a, b in zip(low, high, strict=True)]
+
+
+@dataclass(frozen=True)
+class Weights:
+    """How much arriving light counts on each map of an `AngularBasis`."""
+
+    plain: _Columns
+    skew: _Columns
+
+    def at(self, cosine: mi.Float, x: mi.Float, y: mi.Float, active: mi.Bool) -> list[mi.Float]:
+        """Weights on the maps of light at a cosine of incidence, whose direction has the parts x and y along
+        the surface, of any length."""
+        skew = self.skew.at(cosine, active)
+        unit = dr.rsqrt(dr.maximum(dr.square(x) + dr.square(y), 1e-20))
+        return [*self.plain.at(cosine, active), *(w * x * unit for w in skew), *(w * y * unit for w in skew)]
+
+
+def angular_basis(
+    optics: ContactOptics, coupling: Coupling, tolerance: float = 5e-5, skew_tolerance: float = 2e-3
+) -> AngularBasis:
+    """Truncated singular value decompositions, largest errors at most `tolerance`; `skew_tolerance` is
+    relative to the largest skew."""
+    lobes = coupling.lobes
+    rows, columns = _separated((lobes[:, None] * optics.transmittance).reshape(-1, lobes.shape[1]), tolerance)
+    largest = max(float(np.abs(coupling.skew).max()), 1e-12)
+    skews = _separated(coupling.skew * optics.transmittance, skew_tolerance * largest)
+    return AngularBasis(rows.reshape(len(lobes), -1, len(columns)), columns, *skews)
+
+
+def _separated(products: Array, tolerance: float) -> tuple[Array, Array]:
     u, s, v = np.linalg.svd(products, full_matrices=False)
     for count in range(1, s.size + 1):
         rows, columns = u[:, :count] * s[:count], v[:count]
         if np.abs(rows @ columns - products).max() <= tolerance:
             break
-    return AngularBasis(rows.reshape(len(lobes), -1, count), columns)
-
-
-def weigh(weights: mi.Float, count: int, n_cos: int, cosine: mi.Float, active: mi.Bool) -> list[mi.Float]:
-    """The basis' columns at a cosine; `weights` is their (n_cos, count) table, flattened."""
-    at = dr.clip(cosine, 0.0, 1.0) * (n_cos - 1)
-    node = dr.minimum(mi.UInt32(at), n_cos - 2)
-    share = at - mi.Float(node)
-    low = [dr.gather(mi.Float, weights, node * count + k, active) for k in range(count)]
-    high = [dr.gather(mi.Float, weights, (node + 1) * count + k, active) for k in range(count)]
-    return [dr.lerp(a, b, share) for a, b in zip(low, high, strict=True)]
+    return rows, columns
 
 
 def look_up(maps: Array, x: mi.Float, y: mi.Float) -> list[mi.Float]:
@@ -67,11 +113,33 @@ def look_up(maps: Array, x: mi.Float, y: mi.Float) -> list[mi.Float]:
     return list(mi.Texture2f(mi.TensorXf(layers), wrap_mode=dr.WrapMode.Clamp).eval(mi.Point2f(x, y)))
 
 
-def transmitted(basis: AngularBasis, irradiance: Array, fraction: Array) -> Array:
-    """Irradiance that enters the tissue in each mode, (n, modes, m, m) W/mm², of (n, count, m, m), where the
-    real contact fraction is (m, m)."""
-    rows = np.moveaxis(basis.rows, 0, 1)
-    return np.einsum("yxik,nkyx->niyx", by_fraction(rows, fraction), irradiance, optimize=True)
+def transmitted(basis: AngularBasis, irradiance: Array, fraction: Array, width_mm: float) -> Array:
+    """Irradiance that enters the tissue in each mode, (n, modes, m, m) W/mm², of maps (n, layers, m, m) where
+    the real contact fraction is (m, m), on cells over a face of `width_mm`.
+
+    Light that enters aslant is carried ahead to where it will come out, to first order: E_0 - div(skewed
+    light).
+    """
+    count, skews = len(basis.columns), len(basis.skew_columns)
+    rows = by_fraction(np.moveaxis(basis.rows, 0, 1), fraction)
+    entering = np.einsum("yxik,nkyx->niyx", rows, irradiance[:, :count], optimize=True)
+    ahead = by_fraction(basis.skew_rows, fraction)
+    parts = irradiance[:, count:].reshape(len(irradiance), 2, skews, *fraction.shape)
+    carried = np.einsum("yxk,nckyx->ncyx", ahead, parts, optimize=True)
+    entering[:, 0] -= _divergence(carried, width_mm / fraction.shape[0])
+    return np.asarray(entering)
+
+
+def _divergence(flow: Array, step: float) -> Array:
+    """Of flows (n, 2, m, m), x first, on cells of that step; over the rim they go out, none come in."""
+    total = np.zeros((flow.shape[0], *flow.shape[2:]))
+    for part, axis in ((flow[:, 0], 2), (flow[:, 1], 1)):
+        along = np.moveaxis(part, axis, -1)
+        faces = np.empty((*along.shape[:-1], along.shape[-1] + 1))
+        faces[..., 1:-1] = 0.5 * (along[..., 1:] + along[..., :-1])
+        faces[..., 0], faces[..., -1] = np.minimum(along[..., 0], 0.0), np.maximum(along[..., -1], 0.0)
+        total += np.moveaxis(np.diff(faces, axis=-1), -1, axis) / step
+    return total
 
 
 def by_fraction(rows: Array, fraction: Array) -> Array:

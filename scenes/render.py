@@ -81,7 +81,7 @@ class Renderer:
             coupling = build.coupling_of(sensor, optics)
             _, body = tissue.body_behind(sensor.skin, sensor.tissue)
             spreads = spread.spreader(body, coupling, sensor.guide.width_mm, transport.GRID)
-            self.basis = angular_basis(optics, coupling.lobes)
+            self.basis = angular_basis(optics, coupling)
         self.behind = transport.Behind(coupling, spreads)
         self.packed = Table.pack(optics, coupling)
         self.table = Table(self.packed)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from .bsdf import Table
 from .build import led_frame
-from .irradiance import AngularBasis, look_up, weigh
+from .irradiance import AngularBasis, look_up
 from .lamp import Patterns
 from .sensor import Sensor
 from .tissue import Coupling
@@ -46,8 +46,8 @@ class Landed:
 
     Attributes
     ----------
-    maps : (n_led, count, CELLS, CELLS)
-        Sum of throughput times columns[k](cos) on cells [iy, ix] of the deformed surface over the guide's
+    maps : (n_led, layers, CELLS, CELLS)
+        Sum of throughput times the basis' weights on cells [iy, ix] of the deformed surface over the guide's
         face, without what `direct` gathers.
     sinks : (n_led, len(SINKS))
         Sum of throughput that ended there, gathered light included.
@@ -85,10 +85,9 @@ def walk(
     seed
         The result depends on nothing else, not even on the number of threads.
     """
-    n_led, count, width = len(sensor.leds), basis.count, sensor.guide.width_mm
-    n_cos = basis.columns.shape[1]
-    weights = mi.Float(np.ascontiguousarray(basis.columns.T, dtype=np.float32).ravel())
-    maps = dr.zeros(mi.Int64, n_led * count * CELLS * CELLS)
+    n_led, layers, width = len(sensor.leds), basis.layers, sensor.guide.width_mm
+    weights = basis.weights()
+    maps = dr.zeros(mi.Int64, n_led * layers * CELLS * CELLS)
     named = {shape.id(): mi.ShapePtr(shape) for shape in scene.shapes()}
     contact = next(shape for shape in scene.shapes() if shape.id() == "contact")
     on = mi.ShapePtr(contact)
@@ -121,9 +120,9 @@ def walk(
         lands = on_contact & ~gathered & (si.n.z < -0.5)
         column = mi.UInt32(dr.clip((si.p.x / width + 0.5) * CELLS, 0.0, CELLS - 1.0))
         row = mi.UInt32(dr.clip((si.p.y / width + 0.5) * CELLS, 0.0, CELLS - 1.0))
-        for k, weight in enumerate(weigh(weights, count, n_cos, cosine, lands)):
+        for k, weight in enumerate(weights.at(cosine, ray.d.x, ray.d.y, lands)):
             amount = mi.Int64(dr.round(throughput * weight * _FIXED_POINT))
-            cell = ((number * count + k) * CELLS + row) * CELLS + column
+            cell = ((number * layers + k) * CELLS + row) * CELLS + column
             dr.scatter_add(maps, amount, cell, lands)
         trapped = dr.select(
             on_contact & (trapped < 0.0), dr.select(cosine < critical, throughput, 0.0), trapped
@@ -159,7 +158,7 @@ def walk(
 
     dr.eval(maps, end[6:])
     return Landed(
-        maps.numpy().reshape(n_led, count, CELLS, CELLS).astype(np.float64) / _FIXED_POINT,
+        maps.numpy().reshape(n_led, layers, CELLS, CELLS).astype(np.float64) / _FIXED_POINT,
         np.stack([per_led(amount + dr.zeros(mi.Float, lanes)) for amount in end[7:]], axis=1),
         per_led(dr.maximum(end[6], 0.0)),
     )

@@ -108,7 +108,7 @@ def transport(
     seed
         Seed of every random choice; the result depends on nothing else, not even on the number of threads.
     """
-    n_led = len(sensor.leds)
+    n_led, width = len(sensor.leds), sensor.guide.width_mm
     flux = np.array([led.flux_W for led in sensor.leds])
     starts = np.random.Generator(np.random.Philox(seed)).integers(0, 2**32, size=(_ORDERS + 1, 4))
 
@@ -136,14 +136,14 @@ def transport(
     each = max(samples // 2, 1)
     maps, sinks, trapped, _ = walk(0, each, None)
     landed = straight + smooth(maps, GRID // trace.CELLS)
-    total = newest = _spread(basis, behind, ground, landed)
+    total = newest = _spread(basis, behind, ground, landed, width)
     for order in range(1, _ORDERS + 1):
         if newest[:, 0].sum() <= _ENOUGH * total[:, 0].sum():
             break
         maps, more, _, begun = walk(order, max(each >> min(order - 1, 4), 1), newest)
         sinks = sinks + more
         sinks[:, 0] -= begun
-        newest = _spread(basis, behind, ground, smooth(maps, GRID // trace.CELLS))
+        newest = _spread(basis, behind, ground, smooth(maps, GRID // trace.CELLS), width)
         total = total + newest
     return Light(total, sinks, trapped)
 
@@ -155,7 +155,7 @@ def _first_leg(led: Led) -> int:
     return trace.IN_AIR if led.coupling == "air" else trace.IN_GUIDE
 
 
-def _spread(basis: AngularBasis, behind: Behind, ground: Ground, landed: Array) -> Array:
+def _spread(basis: AngularBasis, behind: Behind, ground: Ground, landed: Array, width_mm: float) -> Array:
     """Light that goes up in the tissue, (n_led, modes, GRID, GRID), from weighted irradiance."""
-    entering = transmitted(basis, landed, ground.fraction) * ground.meets
+    entering = transmitted(basis, landed * ground.meets, ground.fraction, width_mm)
     return behind.spread.solve(entering, ground.fraction)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from functools import cache
 from typing import Any, Literal
 
@@ -29,6 +30,11 @@ def paper_sensor(coupling: Literal["air", "embedded"] = "air", **camera: Any) ->
         tissue=Tissue(),
         effective_modulus_kPa=5.55,
     )
+
+
+def dense(sensor: Sensor) -> Sensor:
+    """The same before tissue so dense that light comes back where it went in, as stock `path` sees it."""
+    return dataclasses.replace(sensor, tissue=Tissue(scattering_per_mm=1000.0, absorption_per_mm=20.0))
 
 
 def pressed(pressure: Any, displacement: Any, cells: int = 50) -> pv.PolyData:

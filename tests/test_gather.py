@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 import pytest
-from sensors import bump, paper_sensor, pressed
+from sensors import bump, dense, paper_sensor, pressed
 
 
 def test_square_pixels_see_the_surface_everywhere(variant: str) -> None:
@@ -50,7 +50,7 @@ def test_led_in_sight_and_its_mirror_image_are_as_path_sees_them(variant: str) -
     from scenes import Renderer
     from scenes.reference import path_trace
 
-    base = paper_sensor("embedded")
+    base = dense(paper_sensor("embedded"))
     inside = tuple(dataclasses.replace(led, gap_mm=4.0) for led in base.leds)
     renderer = Renderer(dataclasses.replace(base, leds=inside), "cpu")
     ours = renderer.render(bump(), quality="preview").radiance.sum(axis=0)

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 import pytest
-from sensors import bump, paper_sensor
+from sensors import bump, dense, paper_sensor
 
 # (first row, last + 1, first column, last + 1) of the paper's 492 x 768 pixels: the blob in the middle, the
 # background beside it, and the edge of the picture next to an LED, where an embedded one makes its hot spot.
@@ -30,7 +30,7 @@ def standard(coupling: Coupling) -> tuple[Any, np.ndarray]:
     """The renderer, its surface in place, and standard pictures of all LEDs, one per seed, W m⁻² sr⁻¹."""
     from scenes import Renderer
 
-    renderer = Renderer(paper_sensor(coupling), "cpu")
+    renderer = Renderer(dense(paper_sensor(coupling)), "cpu")
     runs = [renderer.render(bump(), quality="standard", seed=seed) for seed in SEEDS]
     print(f"{coupling}: noise of one pixel {runs[0].noise_percent:.2f} %")
     return renderer, np.array([run.radiance.sum(axis=0, dtype=np.float64) for run in runs])

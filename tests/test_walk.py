@@ -188,7 +188,7 @@ def test_trapped_light_comes_back_to_the_camera_as_the_walk_says(steps: ModuleTy
     inward = mi.Vector3f(sine * along, sine * across, dr.sqrt(1.0 - sine * sine))
     face = steps.behind_guide(N3, N1, lambda where, cos: table.transmittance(share, cos))
     body = steps.Body(steps.Medium(1.0, 0.02))
-    _, leaves, weight, _ = steps.roam(body, dr.zeros(mi.Point3f, photons), inward, random, face)
+    _, leaves, weight, _, _ = steps.roam(body, dr.zeros(mi.Point3f, photons), inward, random, face)
     light = np.array(weight * table.transmittance(share, cosine), dtype=float) / photons
     outside = 1.0 - (N3 / N1) ** 2 * (
         1.0 - np.array(leaves.z, dtype=float) ** 2
