@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 Illuminant = Literal[
     "LED-B1", "LED-B2", "LED-B3", "LED-B4", "LED-B5", "LED-BH1", "LED-RGB1", "LED-V1", "LED-V2"
 ]
-SpectrumName = Literal["line", "gaussian"] | Illuminant
+SpectrumName = Literal["line", "gaussian", Illuminant]
 ILLUMINANTS: frozenset[str] = frozenset(get_args(Illuminant))
 
 LUMENS_PER_WATT = 683.002

@@ -22,7 +22,7 @@ from twin.frame import FILES, holds_frames, write_frames
 from twin.interrupt import guarded
 from twin.reporting import summarise
 
-FRAME_KEYS = {"inclusion", "press", "fem", "tsis", "design", "seed", "versions", "sha256"}
+FRAME_KEYS = {"inclusion", "press", "lens", "fem", "tsis", "design", "seed", "versions", "sha256"}
 RUN = ["simulate", "--size", "10", "--depth", "5", "--modulus", "100", "--out", "out"]
 
 

@@ -26,15 +26,9 @@ if TYPE_CHECKING:
     import pyvista
 
 RECORD = "frame.json"
-PICTURES = (
-    "frame.exr",
-    "image.png",
-    "image.exr",
-    "tared.png",
-    "reference.exr",
-    "reference.png",
-    "overview.png",
-)
+PICTURES = ("frame.exr", "image.png", "tared.png", "reference.exr", "reference.png", "overview.png")
+MEAN = "image.exr"
+"""Only where the camera averages frames: their mean, with its fractions of counts."""
 FILES = frozenset({RECORD, "surface.vtp", *PICTURES})
 
 _PACKAGES = (
@@ -172,7 +166,7 @@ def holds_frames(folder: Path) -> bool:
 
 def _holds_one_frame(folder: Path) -> bool:
     names = {entry.name for entry in folder.iterdir()}
-    return RECORD in names and names <= FILES
+    return RECORD in names and names <= FILES | {MEAN}
 
 
 def _write(frame: Frame, folder: Path) -> None:
