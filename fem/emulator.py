@@ -1,0 +1,352 @@
+"""A press without a solve: the whole contact field as a smooth function of specimen and indentation.
+
+An emulator knows one probe. It answers in a few milliseconds for the specimens within its ranges, refuses all
+others, and says how far held-out solves were from it. `fem.emulating` builds one, `fem.emulator_file` keeps
+it.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+import pyvista as pv
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+
+from fem import surface
+from fem.mesh import Geometry
+from fem.model import Inclusion, NotModelled, Probe, Slab
+from fem.regression import Regression
+from fem.sampling import Plan, clearance, contrast, lines, quadratic
+from fem.solving import knots
+
+Floats = NDArray[np.float64]
+
+
+CENTRED = [0, 1, 4, 5]
+"""The inputs that are no offsets: all that the gain from a finer mesh depends on, in the mesh's
+coordinates."""
+
+
+@dataclass(frozen=True)
+class Emulated:
+    """Answer of an emulator; fields as those of `fem.Press`, which it can stand in for where no cut is drawn.
+
+    Attributes
+    ----------
+    surface
+        The contact surface with `displacement`, `pressure`, `area` and, without inclusion, `displacement_0`,
+        `pressure_0`, `area_0`.
+    error_percent
+        95th percentile of what held-out solves of inclusions of this kind (thicker than 4 mm, or not) were
+        off by: largest error of the tared displacement, in per cent of its maximum.
+    """
+
+    surface: pv.PolyData
+    indentation_mm: float
+    indentation_0_mm: float
+    force_N: float
+    force_0_N: float
+    min_pressure_kPa: float
+    seconds: float
+    mechanics: str
+    error_percent: float
+    path: str = "emulated"
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors of held-out samples, each left out of what was fitted; in per cent of the field's own maximum.
+
+    `pressure` and `displacement` are of the tared fields on the whole contact surface: largest, and root
+    mean square over the area; (n, 2). `size_mm` (n,) is the inclusion's. `finer` (p, 5): the same of the
+    gain from a finer mesh: size, then pressure and displacement. `curve` (rows, 6): number of samples, core
+    seconds they took, and of a common set of held-out samples with `size_mm` >= 4 the median and the 95th
+    percentile of the pressure's largest error, and of its root mean square.
+    """
+
+    size_mm: Floats
+    pressure: Floats
+    displacement: Floats
+    finer: Floats
+    curve: Floats
+
+    def percentile(self, name: str, percent: float, size_mm: float = 4.0, kind: int = 0) -> float:
+        """Of errors `name` ("pressure" or "displacement") of inclusions with their `size_mm` on this one's
+        side of 4 mm; kind 0: largest, 1: root mean square."""
+        same = (self.size_mm >= 4.0) == (size_mm >= 4.0)
+        found = getattr(self, name)[same, kind]
+        return float(np.percentile(found, percent)) if len(found) else float("nan")
+
+
+@dataclass(frozen=True)
+class Emulator:
+    """The contact field of one probe.
+
+    Attributes
+    ----------
+    plan
+        What was learned, and from which solves.
+    x
+        Lines of the answers' grid along x and y, (m,) mm.
+    unit, pressure, moved
+        Background at the knots (i, j) of thickness and tissue, as `sampling.background` gives it; (i, j,
+        ...).
+    rise, tared
+        What the inclusion adds, as `sampling.solve` gives it, over `amplitudes`.
+    finer_rise, finer_tared
+        What a finer mesh adds to them, as `sampling.refine` gives it, over `amplitudes`.
+    errors
+        From cross-validation.
+    """
+
+    plan: Plan
+    x: Floats
+    unit: Floats
+    pressure: Floats
+    moved: Floats
+    rise: Regression
+    tared: Regression
+    finer_rise: Regression
+    finer_tared: Regression
+    errors: Errors
+
+    def __call__(
+        self,
+        probe: Probe,
+        slab: Slab,
+        inclusion: Inclusion | None,
+        indentation: float | None = None,
+        *,
+        force: float | None = None,
+        mechanics: str | None = None,
+        tilt: tuple[float, float] = (0.0, 0.0),
+        position: tuple[float, float] = (0.0, 0.0),
+    ) -> Emulated:
+        """Press; parameters as of `fem.press`.
+
+        Raises
+        ------
+        ValueError
+            Outside of the emulator's ranges, in one line: field, what was received, what is allowed.
+        NotModelled
+            For what it was not built for.
+        """
+        start = time.perf_counter()
+        if (indentation is None) == (force is None):
+            raise ValueError(
+                f"indentation, force: received {indentation} and {force}; allowed exactly one of the two"
+            )
+        check(self.plan, probe, slab, inclusion, mechanics or self.plan.mechanics, tilt, position)
+        depths = [self._depth(slab, some, indentation, force) for some in (inclusion, None)]
+        found = fields(self, slab, inclusion, depths[0])
+        if depths[1] != depths[0]:
+            found = {
+                **found,
+                **{k: v for k, v in fields(self, slab, None, depths[1]).items() if k.endswith("_0")},
+            }
+        contact = _grid(tuple(self.x)).copy(deep=True)
+        for name, values in found.items():
+            contact.point_data[name] = values.reshape(-1, 3) if values.ndim == 3 else values.ravel()
+        size = 4.0 if inclusion is None else inclusion.size
+        return Emulated(
+            contact,
+            depths[0],
+            depths[1],
+            1e-3 * float((found["pressure"] * found["area"]).sum()),
+            1e-3 * float((found["pressure_0"] * found["area_0"]).sum()),
+            float(min(found["pressure"].min(), found["pressure_0"].min())),
+            time.perf_counter() - start,
+            self.plan.mechanics,
+            self.errors.percentile("displacement", 95, size) if inclusion else 0.0,
+        )
+
+    def _depth(
+        self, slab: Slab, inclusion: Inclusion | None, indentation: float | None, force: float | None
+    ) -> float:
+        """The indentation asked for, or the one that takes the force, mm."""
+        low, high = self.plan.ranges.indentation_mm
+        if indentation is not None:
+            _within("indentation", indentation, (low, high), "mm")
+            return float(indentation)
+        assert force is not None
+
+        def push(depth: float) -> float:
+            found = fields(self, slab, inclusion, depth)
+            return 1e-3 * float((found["pressure"] * found["area"]).sum())
+
+        ends = push(low), push(high)
+        _within("force", force, ends, "N")
+        if self.plan.mechanics == "linear":
+            return force / ends[1] * high
+        return float(brentq(lambda depth: push(depth) - force, low, high, xtol=1e-9))
+
+
+def check(
+    plan: Plan,
+    probe: Probe,
+    slab: Slab,
+    inclusion: Inclusion | None,
+    mechanics: str,
+    tilt: tuple[float, float],
+    position: tuple[float, float],
+) -> None:
+    """Refuse what an emulator was not built for (NotModelled), and what lies outside its ranges
+    (ValueError)."""
+    own = plan.slab(slab.thickness_mm, slab.modulus_kPa)
+    same: list[tuple[str, object, object]] = [
+        ("probe", probe, plan.probe),
+        ("mechanics", mechanics, plan.mechanics),
+    ]
+    same += [(f"slab.{k}", getattr(slab, k), getattr(own, k)) for k in ("width_mm", "poisson", "sides")]
+    same += [("tilt", tuple(tilt), (0.0, 0.0)), ("position", tuple(position), (0.0, 0.0))]
+    if inclusion is not None:
+        same.append(("inclusion.poisson", inclusion.poisson, plan.inner_poisson))
+        same.append(("inclusion.stretch", tuple(inclusion.stretch), (1.0, 1.0, 1.0)))
+    for name, received, allowed in same:
+        if received != allowed:
+            raise NotModelled(
+                f"{name}: received {received}; not in this emulator, which was built for {allowed}"
+            )
+    ranges = plan.ranges
+    _within("slab.thickness_mm", slab.thickness_mm, ranges.thickness_mm, "mm")
+    _within("slab.modulus_kPa", slab.modulus_kPa, ranges.tissue_kPa, "kPa")
+    if inclusion is None:
+        return
+    _within("inclusion.size", inclusion.size, ranges.size_mm, "mm")
+    _within("inclusion.depth", inclusion.depth, ranges.depth_mm, "mm")
+    _within("inclusion.modulus", inclusion.modulus, ranges.modulus_kPa, "kPa")
+    for part in inclusion.offset:
+        _within("inclusion.offset", part, (-ranges.offset_mm, ranges.offset_mm), "mm")
+    room = clearance(inclusion.size, inclusion.depth, slab.thickness_mm)
+    if room < 0:
+        reach = inclusion.size + inclusion.depth
+        raise ValueError(
+            f"inclusion.depth + inclusion.size: received {reach:g} mm; allowed in this emulator up to "
+            f"{reach + room:g} mm in a slab of {slab.thickness_mm:g} mm"
+        )
+
+
+def _within(name: str, value: float, allowed: tuple[float, float], unit: str) -> None:
+    low, high = allowed
+    slack = 1e-9 * max(abs(low), abs(high))
+    if not low - slack <= value <= high + slack:
+        raise ValueError(
+            f"{name}: received {value:g} {unit}; allowed in this emulator {low:g} to {high:g} {unit}"
+        )
+
+
+def fields(emulator: Emulator, slab: Slab, inclusion: Inclusion | None, depth: float) -> dict[str, Floats]:
+    """The fields of `Emulated.surface` on the grid, (m, m) and (m, m, 3), at an indentation in mm."""
+    plan, tissue = emulator.plan, slab.modulus_kPa
+    at, level = knots(plan), lagrange(plan.levels, depth)
+    thick, soft = lagrange(at[0], 1 / slab.thickness_mm), lagrange(at[1], float(np.log(tissue)))
+
+    def background(values: Floats) -> Floats:
+        return np.asarray(np.tensordot(soft, np.tensordot(thick, values, 1), 1))
+
+    pressure_0 = depth * tissue * np.tensordot(level, background(emulator.pressure), 1)
+    displacement_0 = depth * np.tensordot(level, background(emulator.moved), 1)
+    pressure, displacement = pressure_0, displacement_0
+    if inclusion is not None:
+        rise, tared = signal(emulator, slab, inclusion, level)
+        pressure = pressure_0 + rise * depth * tissue * background(emulator.unit)
+        displacement = displacement_0 + depth * tared
+    found = {}
+    for suffix, p, u in (("", pressure, displacement), ("_0", pressure_0, displacement_0)):
+        found["displacement" + suffix], found["pressure" + suffix] = u, np.maximum(p, 0.0)
+        found["area" + suffix] = _area(emulator.x, u, plan.mechanics == "finite")
+    return found
+
+
+def signal(emulator: Emulator, slab: Slab, inclusion: Inclusion, level: Floats) -> tuple[Floats, Floats]:
+    """Rise (m, m) and tared displacement per mm (m, m, 3) on the grid; level: weights of the levels."""
+    plan = emulator.plan
+    x, y = inclusion.offset
+    big, small = max(abs(x), abs(y)), min(abs(x), abs(y))
+    folded = replace(inclusion, offset=(big, small))
+    point = np.array([inclusion.size, inclusion.depth, big, small, slab.thickness_mm, slab.modulus_kPa])
+    s = float(contrast(np.array(inclusion.modulus / slab.modulus_kPa)))
+    nodes = contrast(plan.ratios)
+    along = lagrange(nodes, s)
+    onto = resample(plan, Geometry(plan.probe, slab, folded), emulator.x)
+    inputs, n = features(plan, point[None]), onto[0].shape[1]
+    coarse, finer = (emulator.rise, emulator.tared), (emulator.finer_rise, emulator.finer_tared)
+    parts = []
+    for scale, mostly, little in zip(amplitudes(point, s), coarse, finer, strict=True):
+        signal = np.outer(level, along).ravel() @ mostly(inputs).reshape(len(level) * len(along), -1)
+        parts.append(scale * (signal + along @ little(inputs[:, CENTRED]).reshape(len(along), -1)))
+    rise = onto[0] @ parts[0].reshape(n, n) @ onto[1].T
+    moved = parts[1].reshape(n, n, 3).transpose(2, 0, 1)
+    tared = np.stack([onto[0] @ part @ onto[1].T for part in moved], axis=-1)
+    return unfold(rise, tared, (x, y))
+
+
+def unfold(rise: Floats, tared: Floats, offset: tuple[float, float]) -> tuple[Floats, Floats]:
+    """Fields (..., m, m) and (..., m, m, 3) of an offset x >= y >= 0 as they are at one of its eight
+    images."""
+    x, y = offset
+    if abs(y) > abs(x):
+        rise, tared = rise.swapaxes(-1, -2), tared.swapaxes(-2, -3)[..., [1, 0, 2]]
+    if x < 0:
+        rise, tared = rise[..., ::-1, :], tared[..., ::-1, :, :] * [-1.0, 1.0, 1.0]
+    if y < 0:
+        rise, tared = rise[..., ::-1], tared[..., ::-1, :] * [1.0, -1.0, 1.0]
+    return rise, tared
+
+
+def amplitudes(points: Floats, s: Floats | float) -> tuple[Floats, Floats]:
+    """What the rise and the tared displacement per mm are divided by: s d³ / z², a sphere's far field with
+    z its centre's depth, times one length; the latter also times the tissue's modulus over its thickness,
+    the pressure that a millimetre of indentation makes."""
+    size, depth, thickness, tissue = (points[..., k] for k in (0, 1, 4, 5))
+    rise = np.asarray(s * size**3 / (depth + size / 2) ** 2)
+    return rise, rise * tissue / thickness
+
+
+def features(plan: Plan, points: Floats) -> Floats:
+    """Inputs of the regressions, each about -1 to 1; points (n, 6) as of `Plan.points`."""
+    r = plan.ranges
+    logs = [np.log(np.array(pair)) for pair in (r.size_mm, r.depth_mm, r.thickness_mm, r.tissue_kPa)]
+    scaled = [
+        (np.log(points[:, k]) - pair.mean()) / (np.ptp(pair) / 2)
+        for k, pair in zip((0, 1, 4, 5), logs, strict=True)
+    ]
+    offsets = 2 * points[:, 2:4] / max(r.offset_mm, 1e-9) - 1
+    return np.stack([scaled[0], scaled[1], offsets[:, 0], offsets[:, 1], scaled[2], scaled[3]], axis=1)
+
+
+def resample(plan: Plan, geometry: Geometry, x: Floats) -> tuple[Floats, Floats]:
+    """Matrices (m, n) that carry a field from a sample's nodes to the grid, along x and along y."""
+    along = lines(plan, geometry, plan.grid())
+    return quadratic(along[0], x), quadratic(along[1], x)
+
+
+def lagrange(nodes: Floats, at: float) -> Floats:
+    """Weights (n,) of the polynomial through n nodes."""
+    apart = nodes[:, None] - nodes + np.eye(len(nodes))
+    shares = np.where(np.eye(len(nodes), dtype=bool), 1.0, (at - nodes) / apart)
+    return np.asarray(shares.prod(axis=1))
+
+
+def _area(x: Floats, moved: Floats, finite: bool) -> Floats:
+    """Lumped area of each node (m, m), mm², on the deformed surface seen along z."""
+    lumped, slope = _weights(tuple(x))
+    if not finite:
+        return lumped
+    dx, dy = np.tensordot(slope, moved[..., :2], 1), np.einsum("jk,ikc->ijc", slope, moved[..., :2])
+    return np.asarray(lumped * ((1 + dx[..., 0]) * (1 + dy[..., 1]) - dx[..., 1] * dy[..., 0]))
+
+
+@lru_cache(maxsize=4)
+def _grid(x: tuple[float, ...]) -> pv.PolyData:
+    return surface.contact_surface(np.array(x), np.array(x))
+
+
+@lru_cache(maxsize=4)
+def _weights(x: tuple[float, ...]) -> tuple[Floats, Floats]:
+    along = np.array(x)
+    return np.outer(surface.line_weights(along), surface.line_weights(along)), surface.recovery(along)

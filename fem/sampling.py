@@ -1,0 +1,299 @@
+"""The solves that an emulator learns from: which ones, and what is kept of each.
+
+Everything scales with the tissue's modulus, so the inclusion's enters as the contrast c with it. A sphere's
+signal goes as s = (c - 1) / (c + 1.5) (Eshelby 1957; [eshelby1957]); what is left of c after that is a
+polynomial in s through few nodes, and all of them share one factor. So do the press levels, which are one
+solve at small strain.
+
+Contact pressures are kept as their *rise* over the tissue without inclusion, on the same mesh: next to the
+probe's edge both follow the same singularity, and so does their discretisation error. In the rise both
+cancel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import islice
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ConfigDict, Field, TypeAdapter
+from pydantic.dataclasses import dataclass
+from scipy.stats import qmc
+
+from fem import mesh
+from fem.equilibrium import State
+from fem.mesh import Geometry
+from fem.model import Inclusion, Length, Poisson, Probe, Slab, check
+from fem.path import build, path
+from fem.pressing import _contact
+from fem.solver import one_thread
+from fem.topology import Resolution
+
+Floats = NDArray[np.float64]
+
+_CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False)
+_BEYOND = 0.03  # by how much of a range the samples reach beyond it: at the ends, regression is worst
+_CLEARANCE = 4.0  # mm between inclusion and chest wall
+
+LEAN = Resolution(arc=3, core=1, shell=3, above=3, below=1, edge=2, side=3, layer=1, backing=1)
+"""Mesh of the samples. Its rise differs from 115 thousand unknowns in a quarter by what
+`tests/bench/test_emulator.py` measures."""
+
+FINE = mesh.QUALITIES["standard"]
+"""Mesh of the background and of what makes up for the lean one; its surface is that of the answers."""
+
+
+def contrast(ratio: Floats) -> Floats:
+    """Signal s = (c - 1) / (c + 1.5) of a modulus c times the tissue's."""
+    return np.asarray((ratio - 1) / (ratio + 1.5))
+
+
+Positive = Annotated[float, Field(gt=0, le=1e7)]
+Pair = tuple[Positive, Positive]
+
+
+@dataclass(frozen=True, config=_CONFIG)
+class Ranges:
+    """What an emulator answers for: (lowest, highest)."""
+
+    size_mm: Pair = (2.0, 13.0)
+    depth_mm: Pair = (4.0, 12.0)  # to the top
+    modulus_kPa: Pair = (20.0, 120.0)
+    offset_mm: Annotated[float, Field(ge=0, le=500, description="largest offset along x and y")] = 6.0
+    indentation_mm: Pair = (0.1, 6.0)
+    tissue_kPa: Pair = (3.0, 8.0)
+    thickness_mm: Pair = (24.0, 40.0)
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if isinstance(value, tuple) and not value[0] < value[1]:
+                raise ValueError(
+                    f"ranges.{name}: received {value}; allowed is a lowest below a highest value"
+                )
+        if self.modulus_kPa[0] <= self.tissue_kPa[1]:
+            raise ValueError(
+                f"ranges.modulus_kPa: received {self.modulus_kPa[0]:g} as the lowest; "
+                f"allowed above the stiffest tissue, {self.tissue_kPa[1]:g}"
+            )
+
+
+@dataclass(frozen=True, config=_CONFIG)
+class Plan:
+    """Which sensor and which specimens to learn, and from what kind of solves."""
+
+    probe: Probe
+    width_mm: Length  # of the slab
+    poisson: Poisson = 0.49  # of the tissue
+    sides: Literal["free", "symmetric"] = "free"
+    inner_poisson: Poisson = 0.49  # of the inclusion
+    ranges: Ranges = Ranges()
+    mechanics: Literal["linear", "finite"] = "linear"
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    resolution: Resolution = LEAN
+    fine: Resolution = FINE
+
+    def __post_init__(self) -> None:
+        if self.probe.dome_radius_mm is not None:
+            raise ValueError(
+                f"probe.dome_radius_mm: received {self.probe.dome_radius_mm:g}; "
+                "allowed is none: the emulator learns flat probes only"
+            )
+
+        for name, res in (("resolution", self.resolution), ("fine", self.fine)):
+            if not all(1 <= number <= 32 for number in vars(res).values()):
+                raise ValueError(f"{name}: received {res}; allowed are 1 to 32 cells along each part")
+
+    def slab(self, thickness: float, modulus: float) -> Slab:
+        return Slab(thickness, self.width_mm, modulus, self.poisson, self.sides)
+
+    @property
+    def levels(self) -> Floats:
+        """Indentations between which the answers are a polynomial, mm; small strain needs one."""
+        low, high = self.ranges.indentation_mm
+        return (
+            np.array([1.0]) if self.mechanics == "linear" else np.array([low, 0.3 * high, 0.65 * high, high])
+        )
+
+    @property
+    def ratios(self) -> Floats:
+        """Moduli of the inclusion over the tissue's, evenly spaced in s."""
+        soft, stiff = self.ranges.tissue_kPa
+        low, high = contrast(
+            np.array([self.ranges.modulus_kPa[0] / stiff, self.ranges.modulus_kPa[1] / soft])
+        )
+        s = np.linspace(low, high, 3)
+        return np.asarray((1 + 1.5 * s) / (1 - s))
+
+    def points(self) -> Iterator[Floats]:
+        """Scrambled Sobol sequence of (size, depth, offsets x >= y >= 0, thickness, tissue), those that
+        fit."""
+        r = self.ranges
+        low, high = (
+            np.array(side) for side in zip(r.size_mm, r.depth_mm, r.thickness_mm, r.tissue_kPa, strict=True)
+        )
+        beyond = _BEYOND * (high - low)
+        sobol = qmc.Sobol(6, scramble=True, rng=np.random.default_rng(self.seed))
+        while True:
+            for u in sobol.random(64):
+                size, depth, thickness, tissue = low - beyond + u[:4] * (high - low + 2 * beyond)
+                y, x = np.sort(u[4:]) * r.offset_mm * (1 + _BEYOND)
+                if clearance(size, depth, thickness) >= 0:
+                    yield np.array([size, depth, x, y, thickness, tissue])
+
+    def point(self, number: int) -> Floats:
+        return next(islice(self.points(), number, None))
+
+    def grid(self) -> Floats:
+        """Logical lines of the samples' nodes on the footprint, (n,)."""
+        return logical_lines(self.resolution)
+
+
+PLAN: TypeAdapter[Plan] = TypeAdapter(Plan)
+
+
+def clearance(size: float, depth: float, thickness: float) -> float:
+    """Room left between an inclusion and the chest wall, less what an emulator wants there, mm."""
+    return thickness - _CLEARANCE - size - depth
+
+
+def logical_lines(res: Resolution) -> Floats:
+    """Logical coordinates of the nodes along x on the footprint, (n,)."""
+    box = res.reach * np.arange(2 * res.arc + 1) / (2 * res.arc)
+    half = np.concatenate([box, res.reach + np.arange(1, 2 * res.edge + 1) / 2])
+    return np.concatenate([-half[:0:-1], half])
+
+
+def lines(plan: Plan, geometry: Geometry, logical: Floats) -> tuple[Floats, Floats]:
+    """Real coordinates of the samples' nodes along x and y, mm, each (n,)."""
+    spans = mesh.box_around(geometry).surface
+    return spans[0].lines(logical, plan.resolution), spans[1].lines(logical, plan.resolution)
+
+
+def geometry_at(plan: Plan, point: Floats, modulus: float) -> Geometry:
+    """Geometry of a point of the plan, with an inclusion of a modulus, kPa."""
+    size, depth, x, y, thickness, tissue = (float(v) for v in point)
+    slab = plan.slab(thickness, tissue)
+    inclusion = Inclusion(size, depth, modulus, (x, y), plan.inner_poisson)
+    check(plan.probe, slab, inclusion)
+    return Geometry(plan.probe, slab, inclusion)
+
+
+def solve(plan: Plan, point: Floats) -> dict[str, Floats]:
+    """Solve one point for all levels and moduli.
+
+    Returns
+    -------
+    `rise` (levels, moduli, n, n): pressure over the same without inclusion, in units of the pressure of the
+    tied, small-strain press without inclusion; `moved` (levels, moduli, n, n, 3): tared displacement per mm
+    of indentation.
+    """
+    geometries = [geometry_at(plan, point, float(r * point[5])) for r in plan.ratios]
+    first, finite = geometries[0], plan.mechanics == "finite"
+    with one_thread():
+        model = build(first, plan.resolution, finite)
+        bare = path(first, model, False)
+        level = float(plan.levels[0])
+        unit = None
+        if finite:
+            state = path(first, build(first, plan.resolution, False), False).to(1.0)
+            unit = _fields(first, (state, state), plan.resolution)[0]
+        rise, moved = [], []
+        for geometry in geometries:
+            full = path(geometry, model, True, bare)
+            for level in plan.levels:
+                states = full.to(float(level)), bare.to(float(level))
+                pressure, displacement, pressure_0, displacement_0 = _fields(
+                    geometry, states, plan.resolution
+                )
+                scale = pressure_0 if unit is None else unit * level
+                rise.append((pressure - pressure_0) / scale)
+                moved.append((displacement - displacement_0) / level)
+    shape = len(geometries), len(plan.levels)
+    return {
+        "rise": np.stack(rise).reshape(*shape, *rise[0].shape).swapaxes(0, 1),
+        "moved": np.stack(moved).reshape(*shape, *moved[0].shape).swapaxes(0, 1),
+    }
+
+
+def refine(plan: Plan, point: Floats) -> dict[str, Floats]:
+    """What the finer mesh adds to `solve` at small strain under the probe's middle, where symmetry makes it
+    cheap.
+
+    Returns
+    -------
+    `rise` (1, moduli, n, n) and `moved` (1, moduli, n, n, 3): fine minus lean, at the lean mesh's nodes.
+    """
+    point = np.array([*point[:2], 0.0, 0.0, *point[4:]])
+    plans = [replace(plan, mechanics="linear", resolution=res) for res in (plan.resolution, plan.fine)]
+    lean, fine = (solve(p, point) for p in plans)
+    geometry = geometry_at(plan, point, 1.0)
+    nodes = [lines(p, geometry, p.grid())[0] for p in plans]
+    onto = quadratic(nodes[1], nodes[0])
+    rise = np.einsum("ai,lcij,bj->lcab", onto, fine["rise"], onto, optimize=True)
+    moved = np.einsum("ai,lcijk,bj->lcabk", onto, fine["moved"], onto, optimize=True)
+    return {"rise": rise - lean["rise"], "moved": moved - lean["moved"]}
+
+
+def background(plan: Plan, thickness: float, tissue: float) -> dict[str, Floats]:
+    """Press on plain tissue, on the grid that answers are given on.
+
+    Returns
+    -------
+    Lines `x` (m,); per kPa of the tissue and mm of indentation: `unit` (m, m), the pressure of the tied
+    press at small strain, and `pressure` (levels, m, m); `moved` (levels, m, m, 3), displacement per mm of
+    indentation.
+    """
+    res = plan.fine
+    # an inclusion that is left out gives every thickness the same lines
+    still = Inclusion(0.3 * plan.probe.width_mm, 0.2 * thickness, tissue)
+    geometry = Geometry(plan.probe, plan.slab(thickness, tissue), still)
+    with one_thread():
+        linear = path(geometry, build(geometry, res, False), False)
+        state = linear.to(1.0)
+        unit, moved, _, _ = _fields(geometry, (state, state), res)
+        contact, _ = _contact(geometry, (state, state), res.edge)
+        x = np.unique(np.round(np.asarray(contact.points[:, 0], dtype=float), 9))
+        found: dict[str, list[Floats]] = {"pressure": [unit], "moved": [moved]}
+        if plan.mechanics == "finite":
+            bare = path(geometry, build(geometry, res, True), False)
+            found = {"pressure": [], "moved": []}
+            for level in plan.levels:
+                state = bare.to(float(level))
+                pressure, moved, _, _ = _fields(geometry, (state, state), res)
+                found["pressure"].append(pressure / level)
+                found["moved"].append(moved / level)
+    return {
+        "x": x,
+        "unit": unit / tissue,
+        "pressure": np.stack(found["pressure"]) / tissue,
+        "moved": np.stack(found["moved"]),
+    }
+
+
+def _fields(
+    geometry: Geometry, states: tuple[State, State], res: Resolution
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Pressure (n, n) and displacement (n, n, 3) on the whole footprint, of both states; kPa, mm."""
+    contact, _ = _contact(geometry, states, res.edge)
+    n = round(contact.n_points**0.5)
+    data = contact.point_data
+    return (
+        np.asarray(data["pressure"], dtype=float).reshape(n, n),
+        np.asarray(data["displacement"], dtype=float).reshape(n, n, 3),
+        np.asarray(data["pressure_0"], dtype=float).reshape(n, n),
+        np.asarray(data["displacement_0"], dtype=float).reshape(n, n, 3),
+    )
+
+
+def quadratic(nodes: Floats, at: Floats) -> Floats:
+    """Weights (m, n) of the nodes of a line of quadratic elements, (n,) n odd, at places (m,)."""
+    first = 2 * np.clip(np.searchsorted(nodes[::2], at, side="right") - 1, 0, (len(nodes) - 1) // 2 - 1)
+    a, b, c = nodes[first], nodes[first + 1], nodes[first + 2]
+    weights, row = np.zeros((len(at), len(nodes))), np.arange(len(at))
+    weights[row, first] = (at - b) * (at - c) / ((a - b) * (a - c))
+    weights[row, first + 1] = (at - a) * (at - c) / ((b - a) * (b - c))
+    weights[row, first + 2] = (at - a) * (at - b) / ((c - a) * (c - b))
+    return weights
