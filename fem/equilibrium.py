@@ -1,9 +1,10 @@
-"""Equilibrium of probe and slab: Newton's method on the forces, conjugate gradients on the tangent, active set.
+"""Equilibrium of probe and slab: Newton's method on the forces, conjugate gradients on the tangent, active
+set.
 
 The tangent is applied element by element and never assembled; a Cholesky factor of an earlier tangent
-(`fem.solver`) preconditions it, so that most Newton steps need no factorisation at all. Which pairs of contact
-nodes are closed is iterated around it (primal-dual active set: Hüeber and Wohlmuth 2005; [hueber2005]): closed pairs
-that pull are opened, open pairs that overlap are closed, until neither is left.
+(`fem.solver`) preconditions it, so that most Newton steps need no factorisation at all. Which pairs of
+contact nodes are closed is iterated around it (primal-dual active set: Hüeber and Wohlmuth 2005;
+[hueber2005]): closed pairs that pull are opened, open pairs that overlap are closed, until neither is left.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.linalg import LinearOperator, cg
 
-from fem import contact, elasticity, solver
-from fem.contact import Interface, Slip
+from fem import elasticity, solver
+from fem.contact import Interface, Tie, tie
 from fem.elasticity import Inverted
 from fem.quadrature import DOFS, Quadrature
 from fem.system import Nodes, System, system
@@ -33,6 +34,9 @@ _NEWTON = 25  # steps at most
 _PATIENCE = 12  # steps after which the residual must have come down to a hundredth of the reaction
 _WORTH = 15  # iterations of conjugate gradients that are worth a new factor
 _CHUNK = 128  # element matrices made double at a time
+_TURNS, _RELAX = 5, 0.7
+_LOOSE = 3e-4  # tolerance while the tie still changes
+_TURN = 1e-3  # change of the contact's slope that is left, in shares of the largest force
 _SETS = 40  # changes of the active set at most
 
 
@@ -74,20 +78,10 @@ class Model:
     def system(self, closed: Bools) -> System:
         return system(self.layout, self.sides, closed)
 
-    def settle(self, moved: Floats, closed: Bools, guess: Slip | None) -> Slip | None:
-        """Put the probe's closed nodes onto the slab's surface, in place; small strain leaves out the slip."""
-        if self.finite:
-            return contact.settle(self.interface, self.place, moved, closed, guess)
-        tip = self.nodes.tip
-        moved[tip, 2] = np.where(closed, moved[tip, 2] + self.gap(moved, None), moved[tip, 2])
-        return None
-
-    def gap(self, moved: Floats, found: Slip | None) -> Floats:
-        """Distance along z between the surfaces at the probe's nodes, (nx, ny) mm; negative where they
-        overlap."""
-        place = self.place + moved
-        height = place[self.nodes.contact, 2] if found is None else found.height
-        return np.asarray(height - place[self.nodes.tip, 2])
+    def settle(self, moved: Floats, closed: Bools, bond: Tie) -> None:
+        """Put the probe's closed nodes onto the slab's surface, in place."""
+        distance = bond.gap(self.place + moved)
+        moved[self.nodes.tip, 2] += np.where(closed, distance, 0.0)
 
     def nodal(self, forces: Floats) -> Floats:
         """Sum of element forces (m, 27, 3) at the nodes, (nodes, 3)."""
@@ -106,7 +100,7 @@ class State:
     force: Floats  # of the probe on the slab along z at each pair, mN, positive pressing; (nx, ny)
     chest: Floats  # of the slab on the chest wall, (3,) mN
     model: Model  # the mesh it belongs to
-    slip: Slip | None = None
+    tie: Tie
 
 
 @dataclass
@@ -135,7 +129,6 @@ class Stiffness:
             hit = self.other[np.minimum(at, len(self.other) - 1)] == elements
             found[hit] = self.instead[at[hit]]
         return found
-
 
     def sheared(self, cells: Ints, slope: Floats) -> Stiffness:
         """In the unknowns x, y and z - G . (x, y) at each node; slope G (nodes, 2)."""
@@ -248,13 +241,23 @@ def equilibrium(body: Body, guess: State) -> State:
     held = model.nodes.held
     state.moved[held] = np.where(held, model.chest(guess.indentation), 0.0)[held]
     seen: set[bytes] = set()
-    for turn in range(_SETS):
-        state = _newton(body, state)
-        distance = model.gap(state.moved, state.slip)
+    turns, held_fast = 0, not model.finite
+    for _ in range(_SETS):
+        if not held_fast:
+            share = 1.0 if turns == 0 else _RELAX
+            state = replace(state, tie=tie(model.interface, model.place + state.moved, state.tie, share))
+            turns += 1
+        before = state.force
+        state = _newton(body, state, _TOLERANCE if held_fast else _LOOSE)
+        off = float(np.abs(state.force - before).max(initial=0.0))
+        distance = state.tie.gap(model.place + state.moved)
         pulls = state.closed & (state.force < 0)
         overlaps = ~state.closed & (distance < 0)
         if not (pulls.any() or overlaps.any()):
-            return state
+            if held_fast:
+                return state
+            held_fast = turns >= _TURNS or off <= _TURN * float(np.abs(state.force).max(initial=0.0))
+            continue
         closed = (state.closed & ~pulls) | overlaps
         key = closed.tobytes()
         if key in seen:  # going round in circles: change one pair at a time, the worst
@@ -270,33 +273,31 @@ def equilibrium(body: Body, guess: State) -> State:
     raise NotConverged("the set of closed contact pairs does not settle")
 
 
-def _newton(body: Body, start: State) -> State:
-    """Equilibrium for a given set of closed pairs."""
-    model, closed, moved = start.model, start.closed, start.moved
+def _newton(body: Body, start: State, tolerance: float) -> State:
+    """Equilibrium for a given set of closed pairs and slopes."""
+    model, closed, moved, bond = start.model, start.closed, start.moved, start.tie
     sys = model.system(closed)
     tip, at_chest = model.nodes.tip, model.nodes.chest
-    found = model.settle(moved, closed, None)
+    model.settle(moved, closed, bond)
     forces, energy = body.forces(model, moved)
     renew = False
     for turn in range(_NEWTON):
         normal = np.where(closed, forces[tip, 2], 0.0)
-        residual = sys.gather(_reduce(found, forces, normal, tip))
+        residual = sys.gather(bond.hand_on(forces, normal))
         size, scale = float(np.linalg.norm(residual)), float(np.linalg.norm(forces[at_chest]))
-        if size <= max(_TOLERANCE * scale, body.floor):
-            return replace(start, moved=moved, force=-normal, chest=-forces[at_chest].sum(axis=0), slip=found)
+        if size <= max(tolerance * scale, body.floor):
+            return replace(start, moved=moved, force=-normal, chest=-forces[at_chest].sum(axis=0))
         if turn >= _PATIENCE and size > 1e-2 * scale:
             raise NotConverged("Newton's method does not come down")
         matrices = body.tangent(model, moved)
-        slope = None if found is None else found.nodal_slope(len(model.place))
-        factor = body.factor(sys, matrices, slope, renew)
-        change, steps, downhill = _solve(body, model, sys, found, matrices, factor, normal, -residual)
+        factor = body.factor(sys, matrices, bond.slopes(len(moved)) if model.finite else None, renew)
+        change, steps, downhill = _solve(body, model, sys, bond, matrices, factor, -residual)
         renew = model.finite and steps > _WORTH
         body.effort.newton += 1
         # far from equilibrium, no step may raise the energy (Armijo's rule); near it rounding would decide
         for cut in range(_HALVINGS):
             trial = moved + 0.5**cut * change
             try:
-                found_t = model.settle(trial, closed, found)
                 forces_t, energy_t = body.forces(model, trial)
             except Inverted:
                 continue
@@ -304,28 +305,17 @@ def _newton(body: Body, start: State) -> State:
                 break
         else:
             raise NotConverged("no step lowers the energy")
-        moved, found, forces, energy = trial, found_t, forces_t, energy_t
+        moved, forces, energy = trial, forces_t, energy_t
     raise NotConverged("Newton's method does not converge")
-
-
-def _reduce(found: Slip | None, forces: Floats, normal: Floats, tip: NDArray[np.int64]) -> Floats:
-    """Hand the closed probe nodes' normal forces (nx, ny) on to where they stand; all forces (nodes, 3)."""
-    if found is None:
-        return forces
-    out = forces.copy()
-    out[tip, 2] -= normal
-    found.push(normal, out)
-    return out
 
 
 def _solve(
     body: Body,
     model: Model,
     sys: System,
-    found: Slip | None,
+    bond: Tie,
     matrices: Stiffness,
     factor: Preconditioner,
-    normal: Floats,
     load: Floats,
 ) -> tuple[Floats, int, float]:
     """Change of the displacements (nodes, 3) that a load on the unknowns makes, the iterations taken, and
@@ -334,8 +324,7 @@ def _solve(
 
     def expand(values: Floats) -> Floats:
         change = sys.expand(values)
-        if found is not None:
-            change[tip, 2] = np.where(sys.closed, found.moved(change), change[tip, 2])
+        change[tip, 2] = np.where(sys.closed, bond.height(change), change[tip, 2])
         return change
 
     if not model.finite:
@@ -343,12 +332,8 @@ def _solve(
         return expand(answer), 1, float(load @ answer)
 
     def apply(values: Floats) -> Floats:
-        change = expand(values)
-        force = model.nodal(product(matrices, change, model))
-        if found is not None:
-            force = _reduce(found, force, np.where(sys.closed, force[tip, 2], 0.0), tip)
-            found.stiffen(change, normal, force)
-        return sys.gather(force)
+        force = model.nodal(product(matrices, expand(values), model))
+        return sys.gather(bond.hand_on(force, np.where(sys.closed, force[tip, 2], 0.0)))
 
     count = [0]
 

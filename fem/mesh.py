@@ -1,8 +1,8 @@
 """From logical to real coordinates: hexahedra that morph smoothly with the geometry.
 
-Sizes, depths, offsets and widths only enter here, so every inclusion shares one topology (`fem.topology`), and
-answers vary smoothly with the geometry. Under the contact surface the grid lines follow the inclusion; on the
-surface they stay within the probe's edges, and the layers between shear from one to the other.
+Sizes, depths, offsets and widths only enter here, so every inclusion shares one topology (`fem.topology`),
+and answers vary smoothly with the geometry. Under the contact surface the grid lines follow the inclusion; on
+the surface they stay within the probe's edges, and the layers between shear from one to the other.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 from skfem import ElementHex2, MeshHex2
 
-from fem.model import Inclusion, Pose, Probe, Slab
+from fem.model import STRAIGHT, Inclusion, Pose, Probe, Slab
 from fem.topology import Layout, Resolution, probe_topology, slab_topology
 
 Floats = NDArray[np.float64]
@@ -36,7 +36,7 @@ class Geometry:
     probe: Probe
     slab: Slab
     inclusion: Inclusion | None = None
-    pose: Pose = Pose()
+    pose: Pose = STRAIGHT
 
     def layout(self, res: Resolution) -> Layout:
         """The topology that the symmetry of this geometry allows; no cells beside a probe as wide as the
@@ -45,9 +45,7 @@ class Geometry:
             res = Resolution(**{**res.__dict__, "side": 0})
         offset = (0.0, 0.0) if self.inclusion is None else self.inclusion.offset
         turned = self.pose.tilt_deg[::-1]  # a turn about y breaks the symmetry in x
-        broken = [
-            any((o, p, t)) for o, p, t in zip(offset, self.pose.position_mm, turned, strict=True)
-        ]
+        broken = [any((o, p, t)) for o, p, t in zip(offset, self.pose.position_mm, turned, strict=True)]
         return Layout(res, len(self.probe.layers), (not broken[0], not broken[1]))
 
 
@@ -64,7 +62,8 @@ class Span:
     side_high: float
 
     def lines(self, logical: Floats, res: Resolution) -> Floats:
-        """Real coordinate of logical ones: even in the box, finer towards the probe's edge from both sides."""
+        """Real coordinate of logical ones: even in the box, finer towards the probe's edge from both
+        sides."""
         knots = np.concatenate([[0.0], res.reach + np.arange(res.edge + res.side + 1.0)])
 
         def half(box: float, edge: float, side: float) -> Floats:
@@ -217,7 +216,10 @@ def morph_slab(layout: Layout, geometry: Geometry, shift: Floats | None = None) 
     blend = np.clip((p[2] + res.reach + res.above) / res.above, 0, 1)
     real = np.stack(
         [
-            *((1 - blend) * box.surface[k].lines(p[k], res) + blend * box.deep[k].lines(p[k], res) for k in (0, 1)),
+            *(
+                (1 - blend) * box.surface[k].lines(p[k], res) + blend * box.deep[k].lines(p[k], res)
+                for k in (0, 1)
+            ),
             np.interp(p[2], knots, heights),
         ]
     )
@@ -238,7 +240,10 @@ def _extended(layout: Layout, shift: Floats, logical: Floats) -> Floats:
     padding = []
     for symmetric in layout.symmetric:
         half = np.concatenate(
-            [res.reach * np.arange(2 * res.arc + 1) / (2 * res.arc), res.reach + np.arange(1, 2 * res.edge + 1) / 2]
+            [
+                res.reach * np.arange(2 * res.arc + 1) / (2 * res.arc),
+                res.reach + np.arange(1, 2 * res.edge + 1) / 2,
+            ]
         )
         # a symmetry plane is no side: the field goes on beyond it
         lines.append(np.concatenate([half if symmetric else _mirrored(half), [side]]))

@@ -153,7 +153,11 @@ class Pose:
     )
 
 
-def check(probe: Probe, slab: Slab, inclusion: Inclusion | None, pose: Pose = Pose()) -> None:
+STRAIGHT = Pose()
+"""Straight down, above the slab's middle."""
+
+
+def check(probe: Probe, slab: Slab, inclusion: Inclusion | None, pose: Pose = STRAIGHT) -> None:
     """Raise ValueError for the impossible and NotModelled for the merely unsupported, in one line."""
     if probe.width_mm > slab.width_mm:
         raise NotModelled(
@@ -168,21 +172,22 @@ def check(probe: Probe, slab: Slab, inclusion: Inclusion | None, pose: Pose = Po
     thinnest = probe.layers[0].thickness_mm * MAX_SAG
     if probe.sag_mm > thinnest:
         raise ValueError(
-            f"probe.dome_radius_mm: received {probe.dome_radius_mm:g}, whose corners lie {probe.sag_mm:.3g} mm "
-            f"below the apex; allowed are domes less than {thinnest:g} mm high "
+            f"probe.dome_radius_mm: received {probe.dome_radius_mm:g}, whose corners lie "
+            f"{probe.sag_mm:.3g} mm below the apex; allowed are domes less than {thinnest:g} mm high "
             f"({MAX_SAG:.0%} of the contact layer)"
         )
     room = (slab.width_mm - probe.width_mm) / 2
     away = max(abs(p) for p in pose.position_mm)
     if away > 0 and away > room - 0.02 * slab.width_mm:
         raise NotModelled(
-            f"position: received ({pose.position_mm[0]:g}, {pose.position_mm[1]:g}) mm; not modelled: a probe "
-            f"at or over the slab's side, allowed up to {max(0.0, room - 0.02 * slab.width_mm):g} mm"
+            f"position: received ({pose.position_mm[0]:g}, {pose.position_mm[1]:g}) mm; "
+            f"not modelled: a probe at or over the slab's side, "
+            f"allowed up to {max(0.0, room - 0.02 * slab.width_mm):g} mm"
         )
     if any(pose.tilt_deg) and slab.sides == "symmetric":
         raise NotModelled(
-            f"tilt: received ({pose.tilt_deg[0]:g}, {pose.tilt_deg[1]:g}) degrees with slab.sides = symmetric; "
-            "not modelled: allowed are free sides"
+            f"tilt: received ({pose.tilt_deg[0]:g}, {pose.tilt_deg[1]:g}) degrees "
+            "with slab.sides = symmetric; not modelled: allowed are free sides"
         )
     if inclusion is not None:
         _check_inclusion(probe, slab, inclusion, pose)

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fem import contact, elasticity, mesh, solver
-from fem.contact import Interface, line
+from fem import elasticity, mesh
+from fem.contact import Interface, level, line
 from fem.elasticity import Inverted
 from fem.equilibrium import Body, Model, NotConverged, State, Stiffness, equilibrium, product
 from fem.mesh import Geometry
@@ -18,7 +18,7 @@ from fem.topology import Resolution, materials
 
 Floats = NDArray[np.float64]
 
-_LONGEST = 3.0  # mm of indentation in one step
+_LONGEST = 1.0  # mm of indentation in one step
 _MANY = 4500  # elements from which on their stiffness is kept in single precision
 _SECANT, _FORCE = 25, 1e-9  # steps to find a force, and how well to meet it
 _CUTS = 9  # halvings of a step at most
@@ -35,7 +35,7 @@ def build(geometry: Geometry, res: Resolution, finite: bool, shift: Floats | Non
         layout,
         geometry.slab.sides,
         found,
-        Interface(found.contact, found.tip, line(x), line(y)),
+        Interface(found.contact, found.tip, line(x), line(y), layout.symmetric),
         join([quadrature(slab), quadrature(probe)]),
         place,
         np.zeros((*found.tip.shape, 2)) if shift is None else shift,
@@ -46,7 +46,8 @@ def build(geometry: Geometry, res: Resolution, finite: bool, shift: Floats | Non
 
 
 def follow(geometry: Geometry, model: Model, shift: Floats) -> Model:
-    """The same model with the slab's contact nodes moved within its surface, to where the probe's nodes are."""
+    """The same model with the slab's contact nodes moved within its surface, to where the probe's nodes
+    are."""
     slab = mesh.morph_slab(model.layout, geometry, shift)
     quad, place, cut = quadrature(slab), model.place.copy(), model.nodes.slab_cells
     place[: model.nodes.slab] = slab.doflocs.T
@@ -135,7 +136,7 @@ class Path:
                 for i in range(len(x))
             ]
             moved = np.asarray(sum(w * s.moved for w, s in zip(weights, known, strict=True)))
-        guess = replace(near, indentation=indentation, moved=moved, slip=None)
+        guess = replace(near, indentation=indentation, moved=moved)
         return replace(guess, model=self._model(indentation)) if near.model.finite else guess
 
     def by_force(self, force: float) -> State:
@@ -181,7 +182,11 @@ class Path:
     def _line(self, near: State, indentation: float) -> list[State]:
         """Up to three states to extrapolate from, none of them nearer to the next than the way to go."""
         known, way = [near], abs(indentation - near.indentation)
-        behind = [s for s in self.states if (s.indentation - near.indentation) * (indentation - near.indentation) < 0]
+        behind = [
+            s
+            for s in self.states
+            if (s.indentation - near.indentation) * (indentation - near.indentation) < 0
+        ]
         for state in sorted(behind, key=lambda s: abs(s.indentation - near.indentation)):
             if abs(state.indentation - known[-1].indentation) >= 0.99 * way and len(known) < 3:
                 known.append(state)
@@ -232,10 +237,11 @@ def path(geometry: Geometry, model: Model, inclusion: bool, beside: Path | None 
         rest = replace(beside.body.rest, other=model.ball, instead=ball)
     body = Body(shear, bulk, rest, model.finite, inclusion, {} if beside is None else beside.body.factors)
     still = np.zeros_like(model.place)
-    clearance = model.gap(still, contact.slip(model.interface, model.place) if model.finite else None)
+    bond = level(model.interface)
+    clearance = bond.gap(model.place)
     flat = bool(np.abs(clearance).max() < 1e-9)
     start = 0.0 if flat else float(clearance.min() / model.normal[2])
     closed = np.full(clearance.shape, flat)
     apart = still - start * model.normal * model.slab
-    nothing = State(start, apart, closed, np.zeros(closed.shape), np.zeros(3), model)
+    nothing = State(start, apart, closed, np.zeros(closed.shape), np.zeros(3), model, bond)
     return Path(geometry, body, [nothing], beside)

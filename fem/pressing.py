@@ -16,7 +16,7 @@ from fem.equilibrium import NotConverged as Stuck
 from fem.equilibrium import State
 from fem.mesh import Geometry
 from fem.model import Inclusion, NotConverged, NotModelled, Pose, Probe, Slab, check
-from fem.path import Path, build, moduli, path
+from fem.path import build, moduli, path
 from fem.solver import one_thread
 from fem.topology import Resolution, materials, probe_topology, slab_topology
 from fem.trust import discretisation_error
@@ -236,9 +236,7 @@ def press_moduli(
     levels, _, _ = _levels(indentation, None)
     _known("quality", quality, mesh.QUALITIES)
     _known("mechanics", mechanics, MECHANICS)
-    several = [
-        _geometry(probe, slab, replace(inclusion, modulus=float(m)), tilt, position) for m in moduli
-    ]
+    several = [_geometry(probe, slab, replace(inclusion, modulus=float(m)), tilt, position) for m in moduli]
     return list(_presses(several, levels, False, mechanics, mesh.QUALITIES[quality], estimate, progress))
 
 
@@ -269,7 +267,7 @@ def _levels(
         )
     name, given = ("indentation", indentation) if force is None else ("force", force)
     several = np.ndim(given) > 0  # type: ignore[arg-type]
-    levels = [float(level) for level in (given if several else [given])]  # type: ignore[union-attr, list-item, arg-type]
+    levels = [float(level) for level in (given if several else [given])]  # type: ignore[union-attr, arg-type]
     for level in levels:
         if not (np.isfinite(level) and level > 0):
             raise ValueError(f"{name}: received {level}; allowed are positive finite numbers")
@@ -311,7 +309,8 @@ def _presses(
                 found: dict[float, Press] = {}
                 for level in sorted(set(levels)):
                     states = tuple(
-                        p.by_force(1e3 * level / model.share) if by_force else p.to(level) for p in (full, bare)
+                        p.by_force(1e3 * level / model.share) if by_force else p.to(level)
+                        for p in (full, bare)
                     )
                     seconds = time.perf_counter() - start
                     found[level] = _press(geometry, states, mechanics, res, error, seconds)  # type: ignore[arg-type]
@@ -374,16 +373,13 @@ def _contact(geometry: Geometry, states: tuple[State, State], edge: int) -> tupl
     whole_x, whole_y = surface.mirror_line(x, half[0]), surface.mirror_line(y, half[1])
     contact = surface.contact_surface(whole_x, whole_y, surface.mirror_grid(at[..., 2], symmetric=half))
     lumped = np.outer(surface.line_weights(whole_x), surface.line_weights(whole_y)).ravel()
-    along = surface.recovery(x), surface.recovery(y)
     lowest = np.inf
     for suffix, state in zip(("", "_0"), states, strict=True):
         moved = state.moved[nodes.tip]
         pressure = surface.pressure(np.maximum(state.force, 0.0), x, y, edge, state.closed)
         stretch = np.ones(pressure.shape)
         if state.model.finite:  # area that the deformed surface covers, seen along z
-            lateral = (at + moved)[..., :2]
-            dx, dy = np.tensordot(along[0], lateral, 1), np.einsum("jk,ikc->ijc", along[1], lateral)
-            stretch = dx[..., 0] * dy[..., 1] - dx[..., 1] * dy[..., 0]
+            stretch = np.linalg.det(state.model.interface.derivatives(at + moved)[..., :2])
         if not np.isfinite(pressure).all():
             raise NotModelled(_TOO_UNEVEN)
         pressure = pressure / stretch

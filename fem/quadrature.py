@@ -1,4 +1,5 @@
-"""Quadrature of the 27-node hexahedron on curved elements: 27 Gauss points, gradients, linear pressure modes."""
+"""Quadrature of the 27-node hexahedron on curved elements: 27 Gauss points, gradients, linear pressure
+modes."""
 
 from __future__ import annotations
 
@@ -50,7 +51,9 @@ class Quadrature:
 
     def part(self, elements: Ints) -> Quadrature:
         """The same for some of the elements."""
-        return Quadrature(*(field[elements] for field in (self.nodes, self.inverse, self.weight, self.modes)))
+        return Quadrature(
+            self.nodes[elements], self.inverse[elements], self.weight[elements], self.modes[elements]
+        )
 
     @property
     def size(self) -> int:

@@ -45,17 +45,6 @@ def line_weights(x: Floats) -> Floats:
     return weights
 
 
-def recovery(x: Floats) -> Floats:
-    """Matrix (n, n) of the derivative at the nodes of a line of quadratic elements, the mean of both sides
-    at shared nodes; x (n,) are the nodes, n odd."""
-    local = np.array([[-3.0, 4.0, -1.0], [-1.0, 0.0, 1.0], [1.0, -4.0, 3.0]])
-    matrix, count = np.zeros((len(x), len(x))), np.zeros(len(x))
-    for i in range(0, len(x) - 2, 2):
-        matrix[i : i + 3, i : i + 3] += local / (x[i + 2] - x[i])
-        count[i : i + 3] += 1
-    return matrix / count[:, None]
-
-
 _CONSISTENT = np.array([[4.0, 2.0, -1.0], [2.0, 16.0, 2.0], [-1.0, 2.0, 4.0]]) / 30
 _SIMPSON = np.diag([1.0, 4.0, 1.0]) / 6
 
@@ -68,10 +57,10 @@ def pressure(
     The consistent load of a pressure p is M p, with M the mass matrix of the contact faces. Dividing by the
     lumped area instead leaves an alternating error of -0.2 p'' H² at an element's corners and +0.1 p'' H² at
     its middle, H its half length: 3 % of the tared peak at standard quality. Solving with M removes it, but
-    rings next to the singularity at the probe's edge, and where contact ends. So M is consistent inside, lumped
-    (Simpson's rule) across the edge in the `edge` cells next to the probe's edge, and lumped around open pairs
-    and wherever it would still give a negative pressure. Its row sums are the lumped areas in any case, so
-    `pressure * area` sums to the force.
+    rings next to the singularity at the probe's edge, and where contact ends. So M is consistent inside,
+    lumped (Simpson's rule) across the edge in the `edge` cells next to the probe's edge, and lumped around
+    open pairs and wherever it would still give a negative pressure. Its row sums are the lumped areas in any
+    case, so `pressure * area` sums to the force.
 
     Parameters
     ----------
@@ -91,7 +80,9 @@ def pressure(
     at_edge = [_edge_cells(line, edge) for line in (x, y)]
     loose = np.zeros(cells, dtype=bool) if closed is None else _around(~closed)
     number = np.arange(reaction.size).reshape(shape)
-    nine = np.stack([number[i : i + 2 * cells[0] : 2, j : j + 2 * cells[1] : 2] for i in range(3) for j in range(3)], -1)
+    nine = np.stack(
+        [number[i : i + 2 * cells[0] : 2, j : j + 2 * cells[1] : 2] for i in range(3) for j in range(3)], -1
+    )
     size_x, size_y = x[2::2] - x[:-2:2], y[2::2] - y[:-2:2]
     for _ in range(20):
         lump_x, lump_y = at_edge[0][:, None] | loose, at_edge[1][None, :] | loose

@@ -1,8 +1,8 @@
 """The unknowns of a press: which node moves how, which pairs are in contact, what is held.
 
-The probe and the slab are two meshes side by side. Where a pair of contact nodes is closed, the probe's node takes
-its z unknown from the slab's, x and y stay free of each other (`fem.contact` adds what sliding changes). All
-is solved in the probe's frame: the glass at rest, the chest wall moving against it.
+The probe and the slab are two meshes side by side. Where a pair of contact nodes is closed, the probe's node
+takes its z unknown from the slab's, x and y stay free of each other (`fem.contact` adds what sliding
+changes). All is solved in the probe's frame: the glass at rest, the chest wall moving against it.
 """
 
 from __future__ import annotations

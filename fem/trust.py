@@ -1,9 +1,9 @@
 """How far a press can be trusted: its discretisation error, estimated from a coarser mesh.
 
 The tared displacement of the contact surface is found once more on the next coarser mesh, by linear
-elasticity (whose discretisation error is nearly that of finite strain, at a fraction of the cost). Both meshes
-have the same topology but for their resolution, so the difference measures the coarser one's error, and a
-fixed share of it the finer one's (`SHARE`, measured; `tests/test_fem_trust.py`).
+elasticity (whose discretisation error is nearly that of finite strain, at a fraction of the cost). Both
+meshes have the same topology but for their resolution, so the difference measures the coarser one's error,
+and a fixed share of it the finer one's (`SHARE`, measured; `tests/test_fem_trust.py`).
 """
 
 from __future__ import annotations
@@ -11,8 +11,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from fem.contact import line
-from fem.equilibrium import State
 from fem.mesh import QUALITIES, Geometry
 from fem.path import Path, build, path
 from fem.topology import Resolution
@@ -61,9 +59,24 @@ def tared(geometry: Geometry, full: Path, bare: Path) -> Floats:
     field = -(rates[0] - rates[1])[nodes.tip][..., 2]
     at = model.place[nodes.tip]
     rows = []
-    for lines, symmetric in ((at[:, 0, 0], model.layout.symmetric[0]), (at[0, :, 1], model.layout.symmetric[1])):
+    for lines, symmetric in (
+        (at[:, 0, 0], model.layout.symmetric[0]),
+        (at[0, :, 1], model.layout.symmetric[1]),
+    ):
         places = np.abs(np.linspace(-half, half, _GRID)) if symmetric else np.linspace(-half, half, _GRID)
-        found = line(lines)
-        element = np.clip(np.searchsorted(lines[2:-1:2], places), 0, (len(lines) - 3) // 2)
-        rows.append(found.rows(places, element)[0])
+        rows.append(_interpolation(lines, places))
     return np.asarray(rows[0] @ field @ rows[1].T)
+
+
+def _interpolation(lines: Floats, places: Floats) -> Floats:
+    """Weights of the nodes of quadratic elements (n,) at places (m,); (m, n)."""
+    first = 2 * np.clip(np.searchsorted(lines[2:-1:2], places), 0, (len(lines) - 3) // 2)
+    t = (places - lines[first]) / (lines[first + 2] - lines[first])
+    rows = np.zeros((len(places), len(lines)))
+    at = np.arange(len(places))
+    rows[at, first], rows[at, first + 1], rows[at, first + 2] = (
+        (1 - t) * (1 - 2 * t),
+        4 * t * (1 - t),
+        t * (2 * t - 1),
+    )
+    return rows

@@ -15,6 +15,7 @@ from twin import cli
 TSIS = files("assets").joinpath("designs", "tsis.toml").read_text(encoding="utf-8")
 PRESS = ["simulate", "--size", "10", "--depth", "5", "--modulus", "100"]
 FINE = [*PRESS, "--out", "out"]
+EXPORT = ["export", *PRESS[1:]]
 
 
 def mine(old, new):
@@ -25,7 +26,7 @@ def mine(old, new):
 
 # Arguments, and what the line must hold: field, value received, what is allowed.
 FLAGS = {
-    "unknown verb": (["simulat"], ["VERB", "'simulat'", "demo", "simulate", "schema"]),
+    "unknown verb": (["simulat"], ["VERB", "'simulat'", "demo", "simulate", "export", "schema"]),
     "unknown flag": ([*FINE, "--sise", "3"], ["--sise", "--help"]),
     "shortened flag": ([*FINE, "--qual", "preview"], ["--qual"]),
     "no size": (["simulate", "--depth", "5", "--modulus", "9", "--out", "out"], ["--size", "nothing", "> 0"]),
@@ -54,10 +55,45 @@ FLAGS = {
     "negative seed": ([*FINE, "--seed", "-1"], ["--seed", "'-1'", "an integer"]),
     "touches the chest wall": ([*FINE, "--depth", "20"], ["--depth", "20.0", "30 mm", "chest wall"]),
     "leaves the slab": ([*FINE, "--offset", "28", "0"], ["--offset", "(28.0, 0.0)", "less than 25 mm"]),
-    "offset is not modelled": (
-        [*FINE, "--offset", "1", "0"],
-        ["--offset", "(1, 0)", "not modelled", "(0, 0)"],
+    "beside the probe": ([*FINE, "--offset", "13", "0"], ["--offset", "(13.0, 0.0)", "up to 12.5 mm"]),
+    "a tilt too steep": ([*FINE, "--tilt", "0", "12"], ["--tilt", "12.0", "<= 10"]),
+    "half a tilt": ([*FINE, "--tilt", "1"], ["--tilt", "number of values", "2"]),
+    "a tilt in words": ([*FINE, "--tilt", "1", "left"], ["--tilt", "'left'", "a finite number"]),
+    "off the specimen": ([*FINE, "--position", "17", "0"], ["--position", "(17.0, 0.0)", "up to 16.3 mm"]),
+    "a position like no other": ([*FINE, "--position", "0", "1e9"], ["--position", "1000000000.0", "<= 500"]),
+    "pressed where the inclusion is not": (
+        [*FINE, "--position", "16", "0", "--offset", "12", "0"],
+        ["--offset", "(12.0, 0.0)", "less than 25 mm", "at 16 mm"],
     ),
+    "a stretch of nothing": ([*FINE, "--stretch", "1", "0", "1"], ["--stretch", "'0'", "> 0"]),
+    "a stretch too long": ([*FINE, "--stretch", "1", "6", "1"], ["--stretch", "6.0", "<= 5"]),
+    "two stretches": ([*FINE, "--stretch", "1", "2"], ["--stretch", "number of values", "3"]),
+    "a stretch of none": (
+        ["simulate", "--no-inclusion", "--stretch", "1", "1", "2", "--out", "out"],
+        ["--stretch", "--no-inclusion"],
+    ),
+    "stretched to the chest wall": (
+        [*FINE, "--stretch", "1", "1", "2.5"],
+        ["--size", "10.0", "25 + 5 mm", "30 mm", "chest wall"],
+    ),
+    "stretched beyond the probe": (
+        [*FINE, "--stretch", "2.4", "1", "1"],
+        ["--size", "10.0", "22.5 mm", "24 mm"],
+    ),
+    "unknown mechanics": ([*FINE, "--mechanics", "plastic"], ["--mechanics", "'plastic'", "finite, linear"]),
+    "export of nothing": (EXPORT, ["--vtu", "nothing", "the file"]),
+    "another suffix": ([*EXPORT, "--vtu", "a.vtk"], ["--vtu", "'a.vtk'", "ends in .vtu"]),
+    "a suffix alone": ([*EXPORT, "--vtu", ".vtu"], ["--vtu", "'.vtu'", "ends in .vtu"]),
+    "a name that cannot be a file": ([*EXPORT, "--vtu", "a\0b.vtu"], ["--vtu", "a file"]),
+    "two depths in one file": (
+        [*EXPORT, "--indentation", "1", "2", "--vtu", "a.vtu"],
+        ["--indentation", "[1.0, 2.0]", "one depth"],
+    ),
+    "too deep an export": (
+        [*EXPORT, "--indentation", "7", "--vtu", "a.vtu"],
+        ["--indentation", "7.0", "<= 6"],
+    ),
+    "export by force": ([*EXPORT, "--force", "1", "--vtu", "a.vtu"], ["--force", "--help"]),
     "half an offset": ([*FINE, "--offset", "1"], ["--offset", "number of values", "2"]),
     "inclusion and none": ([*FINE, "--no-inclusion"], ["--size", "--no-inclusion"]),
     "a tiny inclusion": ([*FINE, "--size", "0.01"], ["--size", "0.01", ">= 0.1"]),
@@ -102,9 +138,18 @@ DESIGNS = {
         mine("field_of_view_mm = 25.0", "field_of_view_mm = 25.1"),
         ["camera.field_of_view_mm", "25.1", "25 mm"],
     ),
-    "not TOML": (mine("columns = 768", "columns 768"), ["line 8", "TOML"]),
+    "not TOML": (mine("columns = 768", "columns 768"), ["line 9", "TOML"]),
     "a key twice": (mine("columns = 768", "rows = 768"), ["line ", "TOML"]),
     "a date as name": (mine('name = "tsis"', "name = 2020-01-01"), ["name", "2020", "text"]),
+    "a steep dome": (
+        mine("width_mm = 25.0", "width_mm = 25.0\ndome_radius_mm = 60.0"),
+        ["waveguide.dome_radius_mm", "60.0", "at least 98.46 mm"],
+    ),
+    "a tilt that is a number": (mine("tilt_deg = [0.0, 0.0]", "tilt_deg = 2.0"), ["press.tilt_deg", "2.0"]),
+    "unknown sides": (
+        mine('sides = "free"', 'sides = "glued"'),
+        ["specimen.sides", "'glued'", "'symmetric'"],
+    ),
     "a nested surprise": (
         mine("albedo = 0.68", "albedo = {a = [1, {b = 2}]}"),
         ["specimen.albedo", "a number"],
@@ -146,6 +191,15 @@ def test_design_files(text, words, tmp_path, monkeypatch, capfd):
     (tmp_path / "my.toml").write_text(text, encoding="utf-8")
     line = run(["simulate", "my.toml", *FINE[1:]], tmp_path, monkeypatch, capfd)
     for word in ["my.toml", "received", "allowed", *words]:
+        assert word in line
+
+
+def test_a_domed_guide_is_not_lit_yet(tmp_path, monkeypatch, capfd):
+    """Its mechanics can be exported; light in it is refused before any work."""
+    text = mine("width_mm = 25.0", "width_mm = 25.0\ndome_radius_mm = 120.0")
+    (tmp_path / "my.toml").write_text(text, encoding="utf-8")
+    line = run(["simulate", "my.toml", *FINE[1:]], tmp_path, monkeypatch, capfd)
+    for word in ("waveguide.dome_radius_mm", "received 120", "not modelled", "light in a domed guide"):
         assert word in line
 
 
@@ -220,7 +274,12 @@ def twin(*arguments, folder):
         (["simulate", "absent.toml", *FINE[1:]], ["DESIGN", "'absent.toml'"]),
         # Found only once the work is under way: these too are the only line there is.
         ([*FINE, "--device", "cuda"], ["--device", "'cuda'", "allowed"]),
-        ([*FINE, "--force", "3", "--quality", "preview"], ["--force", "3.0", "<= "]),
+        ([*FINE, "--force", "9", "--quality", "preview"], ["--force", "9.0", "<= about"]),
+        (
+            [*FINE, "--force", "2", "--quality", "preview", "--mechanics", "linear"],
+            ["--force", "2.0", "<= about 1.65 N", "6 mm deep"],
+        ),
+        ([*EXPORT, "--vtu", "."], ["--vtu", "'.'", ".vtu"]),
     ],
 )
 def test_as_a_program(arguments, words, tmp_path):
@@ -243,7 +302,7 @@ def test_help_schema_and_mistakes_do_not_wait_for_mitsuba(tmp_path):
     assert ended.stderr.splitlines()[-1] == "set()"
 
 
-@pytest.mark.parametrize("verb", [[], ["demo"], ["simulate"], ["schema"]])
+@pytest.mark.parametrize("verb", [[], ["demo"], ["simulate"], ["export"], ["schema"]])
 def test_every_verb_has_help_with_an_example(verb, capfd):
     assert cli.main([*verb, "--help"]) == 0
     printed = capfd.readouterr().out

@@ -13,9 +13,12 @@ import pytest
 import pyvista as pv
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
 from matplotlib.text import Text
 from PIL import Image
 
+from twin import cutaway
+from twin.panels import draw_tared
 from twin.pictures import DPI, HEIGHT_PX, STYLE, WIDTH_PX, draw_sheet, overview
 
 ROWS, COLUMNS = 492, 768
@@ -115,10 +118,17 @@ def make_frame(
     tared = (0.35 * blob * light * 120 + noise[1]).astype(np.float32)
     return SimpleNamespace(
         design=make_design(),
-        inclusion=SimpleNamespace(size=size, depth=depth, modulus=modulus, offset=(0.0, 0.0))
+        inclusion=SimpleNamespace(
+            size=size, depth=depth, modulus=modulus, offset=(0.0, 0.0), stretch=(1.0, 1.0, 1.0)
+        )
         if size
         else None,
-        press={"indentation_mm": 2.0, "force_N": 0.5617},
+        press={
+            "indentation_mm": 2.0,
+            "force_N": 0.5617,
+            "position_mm": [0.0, 0.0],
+            "tilt_deg": [0.0, 0.0],
+        },
         seed=seed,
         image=image,
         tared=tared,
@@ -129,6 +139,9 @@ def make_frame(
             "raw": {"max_mm": 0.0431, "total_mm3": 15.81, "area_mm2": 625.0},
             "tared": {"max_mm": 0.018, "total_mm3": 2.6731, "area_mm2": 214.7},
             "min_pressure_kPa": 0.41,
+            "path": "sliding",
+            "mechanics": "finite",
+            "error_percent": 0.83,
             "dof": 14203,
             "seconds": 3.2,
         },
@@ -228,10 +241,29 @@ def awkward() -> SimpleNamespace:
     frame = make_frame(13.0, 12.5, 112.55)
     frame.design.name = "a-sensor-with-a-long-name"
     frame.inclusion.offset = (-3.25, 2.75)
+    frame.inclusion.stretch = (1.05, 0.95, 0.9)
+    frame.fem["mechanics"], frame.fem["path"], frame.fem["error_percent"] = "finite", "unilateral", 12.345
     frame.tsis["raw"]["total_dn"] = 96_353_279
     frame.fem["dof"], frame.fem["seconds"], frame.tsis["seconds"] = 1_234_567, 123.4, 1234.5
     for layer in frame.design.waveguide.layers:
         layer.modulus_kPa = 156.25
+    return frame
+
+
+def slanted(tilt: tuple[float, float] = (-3.25, 9.75)) -> SimpleNamespace:
+    """A frame of a tilted press at the side of the specimen, part of it open; y is off the middle too."""
+    frame = make_frame()
+    frame.inclusion.offset = (4.25, -12.5)
+    frame.press |= {"tilt_deg": list(tilt), "position_mm": [-12.25, 3.75]}
+    frame.fem["path"] = "unilateral"
+    a, b = np.radians(tilt)
+    slab = np.arange(frame.cut.n_points) >= frame.cut.n_points - 81 * 41
+    x, z = frame.cut.points[slab, 0] + 12.25, frame.cut.points[slab, 2]
+    # the undeformed slab in the probe's frame: turned back about y, then x
+    x, z = np.cos(b) * x - np.sin(b) * z, np.sin(b) * x + np.cos(b) * z
+    frame.cut.points[slab] = np.stack([x, np.sin(a) * z, np.cos(a) * z], axis=1)
+    pressure = frame.surface.point_data["pressure"]
+    frame.surface.point_data["pressure"] = np.where(frame.surface.points[:, 0] > 6, 0.0, pressure)
     return frame
 
 
@@ -273,6 +305,43 @@ def test_sheet_says_how_it_was_made():
     said = texts(narrow())
     assert {"3 through air, 1 embedded", "6 ms", "LED (beyond the edge, at the guide's side)"} <= set(said)
     assert "saturated pixels" not in said and "saturated pixels" in texts(dark())
+    assert {"finite strain, closed, sliding contact", "0.83 % of its maximum"} <= set(said)
+
+
+def test_sheet_says_where_the_cut_lies_and_how_the_sensor_stands():
+    said = texts(slanted())
+    assert "a  Cut through the inclusion (y = -12.5 mm), pressed 2.00 mm" in said
+    assert "d  What the inclusion (shaded) adds along y = -8.41 mm" in said  # as far as the picture goes
+    assert "finite strain, contact open in places" in said
+    (note,) = (text for text in said if "computed, not photographed" in text)
+    assert note.startswith(
+        "tilted by (-3.25, 9.75)° about x and y · sensor at (-12.25, 3.75) mm of the specimen"
+    )
+
+
+@pytest.mark.parametrize("tilt", [(0.0, 0.0), (0.0, 8.0), (0.0, -8.0), (-5.0, 3.0)])
+def test_the_chest_wall_is_drawn_where_the_mesh_has_it(tilt):
+    """The plane 30 mm above the origin, turned by the tilt and cut with y = 0, under a press of 2 mm."""
+    frame = slanted(tilt)
+    moved = np.asarray(frame.cut.points)[:, [0, 2]] + frame.cut.point_data["displacement"][:, [0, 2]]
+    wall = cutaway._wall(frame, moved)
+    slope = np.degrees(np.arctan2(*(wall[1] - wall[0])[::-1]))
+    a, b = np.radians(tilt)
+    assert slope == pytest.approx(np.degrees(np.arctan(np.cos(a) * np.tan(b))), abs=1e-3)
+    x, z = wall.mean(axis=0)
+    away = np.dot([x, z + 2.0], cutaway._normal(wall))  # the press goes along z
+    assert away == pytest.approx(30 * np.cos(a) / np.hypot(np.cos(b), np.cos(a) * np.sin(b)), rel=1e-4)
+
+
+def test_an_ellipsoid_is_outlined_as_one():
+    frame = make_frame(6.0)
+    frame.inclusion.stretch = (2.0, 1.0, 0.5)
+    assert "12 × 6 × 3 mm (x, y, z)" in " ".join(texts(frame))
+    canvas = FigureCanvasAgg(Figure())
+    axes = canvas.figure.add_subplot()
+    draw_tared(axes, frame, "f")
+    (ellipse,) = (patch for patch in axes.patches if isinstance(patch, Ellipse))
+    assert (ellipse.width, ellipse.height) == (12.0, 6.0)
 
 
 @pytest.mark.filterwarnings("error")
@@ -283,7 +352,8 @@ def test_names_that_the_type_cannot_write_draw_no_warning(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "frame", [make_frame(), make_frame(0.0), make_frame(2.0, 5.0, 120.0), awkward(), dark(), narrow()]
+    "frame",
+    [make_frame(), make_frame(0.0), make_frame(2.0, 5.0, 120.0), awkward(), dark(), narrow(), slanted()],
 )
 def test_no_text_runs_into_another_or_off_the_sheet(frame, monkeypatch):
     drawn: dict[int, Text] = {}  # what is drawn, without the tick labels that matplotlib keeps in reserve

@@ -61,9 +61,13 @@ def test_every_file_is_there_and_holds_the_frames_arrays(frame, folder):
 def test_frame_json_has_exactly_the_promised_keys(frame, folder):
     record = json.loads((folder / "frame.json").read_text(encoding="utf-8"))
     assert set(record) == FRAME_KEYS
-    assert record["inclusion"] == {"size_mm": 10, "depth_mm": 5, "modulus_kPa": 100, "offset_mm": [0, 0]}
-    assert set(record["press"]) == {"indentation_mm", "force_N"}
-    assert set(record["fem"]) == {"raw", "tared", "min_pressure_kPa", "dof", "seconds"}
+    lies = {"size_mm": 10, "depth_mm": 5, "modulus_kPa": 100, "offset_mm": [0, 0], "poisson": 0.49}
+    assert record["inclusion"] == {**lies, "stretch": [1, 1, 1]}
+    assert set(record["press"]) == {"indentation_mm", "force_N", "position_mm", "tilt_deg"}
+    assert (record["press"]["position_mm"], record["press"]["tilt_deg"]) == ([0, 0], [0, 0])
+    trust = {"min_pressure_kPa", "path", "mechanics", "error_percent"}
+    assert set(record["fem"]) == {"raw", "tared", "dof", "seconds", *trust}
+    assert (record["fem"]["path"], record["fem"]["mechanics"]) == ("tied", "linear")
     assert set(record["fem"]["raw"]) == set(record["fem"]["tared"]) == {"max_mm", "total_mm3", "area_mm2"}
     assert set(record["tsis"]) == {"raw", "tared", "seconds", "noise_percent", "saturated_percent"}
     assert set(record["tsis"]["raw"]) == set(record["tsis"]["tared"]) == {"max_dn", "total_dn", "area_px"}
@@ -214,4 +218,5 @@ def test_the_command_line_writes_what_python_returns(frame, tmp_path, monkeypatc
     assert twin.cli.main([*RUN, "--indentation", "1", "2"]) == 0
     assert {path.name for path in (tmp_path / "out" / "01").iterdir()} == FILES
     printed = capfd.readouterr().out
-    assert "10 mm across" in printed and "tared" in printed and "overview.png" in printed
+    assert "10 mm wide" in printed and "linear, closed contact" in printed and "estimated error" in printed
+    assert "tared" in printed and "overview.png" in printed

@@ -10,9 +10,11 @@ from collections.abc import Callable
 from typing import Any, NoReturn
 
 from twin.complaint import shown
-from twin.simulation import Device, Quality
+from twin.presses import Mechanics, Quality
+from twin.simulation import Device
 
 QUALITIES = Quality.__args__  # type: ignore[attr-defined]
+MECHANICS = Mechanics.__args__  # type: ignore[attr-defined]
 DEVICES = Device.__args__  # type: ignore[attr-defined]
 
 _DEMO = """\
@@ -30,7 +32,17 @@ press level in OUT/00, OUT/01, ... Lengths are mm, moduli kPa, forces N.
 examples:
   twin simulate --size 10 --depth 5 --modulus 100 --out out
   twin simulate tsis --size 8 --depth 5 --modulus 120 --indentation 1 2 3 --seed 7 --out levels
-  twin simulate my-sensor.toml --no-inclusion --force 0.5 --out flat
+  twin simulate tsis --size 10 --depth 5 --modulus 100 --offset 3 0 --tilt 0 2 --out tilted
+  twin simulate my-sensor.toml --no-inclusion --force 0.5 --mechanics linear --out flat
+"""
+
+_EXPORT = """\
+Press a sensor on a slab of tissue and write the mechanics for other programs: displacement, stress and
+materials throughout as VTU, which ParaView opens. No light is computed. Lengths are mm, moduli kPa.
+
+examples:
+  twin export --size 10 --depth 5 --modulus 100 --indentation 2 --vtu press.vtu
+  twin export my-sensor.toml --no-inclusion --tilt 0 3 --mechanics linear --vtu tilted.vtu
 """
 
 _SCHEMA = """\
@@ -70,26 +82,24 @@ def _parser() -> Parser:
     simulate.add_argument(
         "design", metavar="DESIGN", nargs="?", default="tsis", help="name or TOML file (default tsis)"
     )
-    above_zero = number(above=0.0)
-    simulate.add_argument("--size", type=above_zero, metavar="MM", help="diameter of the inclusion")
-    simulate.add_argument("--depth", type=above_zero, metavar="MM", help="depth of the inclusion's top")
-    simulate.add_argument("--modulus", type=above_zero, metavar="KPA", help="its Young's modulus")
-    simulate.add_argument(
-        "--offset",
-        type=number(),
-        nargs=2,
-        metavar=("X", "Y"),
-        help="inclusion minus probe centre, mm (default 0 0)",
-    )
-    simulate.add_argument("--no-inclusion", action="store_true", help="homogeneous tissue")
+    _add_inclusion_flags(simulate)
+    _add_pose_flags(simulate)
     press = simulate.add_mutually_exclusive_group()
+    _add_depths(press)
     press.add_argument(
-        "--indentation", type=above_zero, nargs="+", metavar="MM", help="press depths (default: the design's)"
-    )
-    press.add_argument(
-        "--force", type=above_zero, nargs="+", metavar="N", help="press forces instead of depths"
+        "--force", type=number(above=0.0), nargs="+", metavar="N", help="press forces instead of depths"
     )
     _add_run_flags(simulate)
+
+    export = _verb(verbs, "export", "a press as a file for ParaView", _EXPORT)
+    export.add_argument(
+        "design", metavar="DESIGN", nargs="?", default="tsis", help="name or TOML file (default tsis)"
+    )
+    _add_inclusion_flags(export)
+    _add_pose_flags(export)
+    _add_depths(export)
+    export.add_argument("--vtu", metavar="FILE.vtu", help="volume results of one press, for ParaView")
+    _add_quality_flag(export)
 
     _verb(verbs, "schema", "the JSON schema of a design file", _SCHEMA)
     return parser
@@ -106,16 +116,56 @@ def _verb(verbs: Any, name: str, summary: str, text: str) -> Parser:
     return verb
 
 
+def _add_inclusion_flags(parser: Parser) -> None:
+    above_zero = number(above=0.0)
+    parser.add_argument("--size", type=above_zero, metavar="MM", help="diameter of the inclusion")
+    parser.add_argument("--depth", type=above_zero, metavar="MM", help="depth of the inclusion's top")
+    parser.add_argument("--modulus", type=above_zero, metavar="KPA", help="its Young's modulus")
+    _add_pair(parser, "--offset", "inclusion minus probe centre, mm (default 0 0)")
+    parser.add_argument(
+        "--stretch",
+        type=above_zero,
+        nargs=3,
+        metavar=("X", "Y", "Z"),
+        help="ellipsoid: diameters along x, y, z over --size (default 1 1 1)",
+    )
+    parser.add_argument("--no-inclusion", action="store_true", help="homogeneous tissue")
+
+
+def _add_pose_flags(parser: Parser) -> None:
+    parser.add_argument(
+        "--mechanics",
+        type=choice(*MECHANICS),
+        metavar="M",
+        help=" or ".join(MECHANICS) + " strain (default: the design's)",
+    )
+    _add_pair(parser, "--tilt", "turn of the sensor about x, then y, degrees (default: the design's)")
+    _add_pair(parser, "--position", "sensor's centre minus the specimen's, mm (default: the design's)")
+
+
+def _add_depths(place: Any) -> None:
+    place.add_argument(
+        "--indentation",
+        type=number(above=0.0),
+        nargs="+",
+        metavar="MM",
+        help="press depths (default: the design's)",
+    )
+
+
+def _add_pair(parser: Parser, flag: str, text: str) -> None:
+    parser.add_argument(flag, type=number(), nargs=2, metavar=("X", "Y"), help=text)
+
+
+def _add_quality_flag(parser: Parser, more: str = "") -> None:
+    text = ", ".join(QUALITIES) + f" (default standard{more})"
+    parser.add_argument("--quality", type=choice(*QUALITIES), default="standard", metavar="Q", help=text)
+
+
 def _add_run_flags(parser: Parser, out: str | None = None) -> None:
     default = "" if out is None else f" (default {out})"
     parser.add_argument("--out", metavar="DIR", default=out, help="new folder for the results" + default)
-    parser.add_argument(
-        "--quality",
-        type=choice(*QUALITIES),
-        default="standard",
-        metavar="Q",
-        help=", ".join(QUALITIES) + " (default standard; reference traces paths from the camera: hours)",
-    )
+    _add_quality_flag(parser, "; reference traces paths from the camera: hours")
     parser.add_argument(
         "--seed", type=whole, default=0, metavar="N", help="of all random numbers (default 0)"
     )

@@ -1,4 +1,4 @@
-"""The command line: ``twin demo``, ``twin simulate``, ``twin schema``.
+"""The command line: ``twin demo``, ``twin simulate``, ``twin export``, ``twin schema``.
 
 Exit status 0: done; 1: the machine failed (a full disk); 2: bad input, one line on stderr; 130: interrupted.
 Nothing slow is imported until the input has been checked.
@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -38,8 +39,13 @@ _FLAGS = {
     "inclusion.depth": "--depth",
     "inclusion.modulus": "--modulus",
     "inclusion.offset": "--offset",
+    "inclusion.stretch": "--stretch",
     "press.indentation_mm": "--indentation",
     "press.force_N": "--force",
+    "press.tilt_deg": "--tilt",
+    "press.position_mm": "--position",
+    "mechanics": "--mechanics",
+    "vtu": "--vtu",
     "out": "--out",
     "device": "--device",
 }
@@ -63,7 +69,7 @@ def main(argv: list[str] | None = None) -> int:
             except Exception:  # an extension may turn the interrupt that it met into an error of its own
                 interrupt.stop_if_asked()
                 raise
-    except (DesignError, fem.NotModelled, NotModelled, BackendError) as error:
+    except (DesignError, fem.NotModelled, fem.NotConverged, NotModelled, BackendError) as error:
         return _fail(name, _with_flags(str(error)), 2)
     except KeyboardInterrupt:
         return _fail(name, "interrupted; nothing was written", 130)
@@ -89,10 +95,11 @@ def _run(arguments: argparse.Namespace) -> int:
         design = load_design("tsis")
         _simulate(arguments, design, DEMO_INCLUSION, design.press.indentation_mm)
     elif arguments.verb == "simulate":
-        design = load_design(arguments.design)
-        inclusion = _inclusion(arguments)
+        design, inclusion = _pressed(arguments), _inclusion(arguments)
         levels = arguments.force or arguments.indentation or design.press.indentation_mm
         _simulate(arguments, design, inclusion, levels, by_force=bool(arguments.force))
+    elif arguments.verb == "export":
+        _export(arguments, _pressed(arguments), _inclusion(arguments))
     else:
         parse(["--help"])
     return 0
@@ -132,16 +139,50 @@ def _simulate(
     summarise(frames, Path(arguments.out))
 
 
+def _export(arguments: argparse.Namespace, design: Design, inclusion: fem.Inclusion | None) -> None:
+    from twin import export
+
+    if arguments.vtu is None:
+        raise DesignError("--vtu", "nothing", "the file to write")
+    kind: export.Kind = "vtu"
+    name = arguments.vtu
+    levels = arguments.indentation or design.press.indentation_mm
+    export.check(design, inclusion, levels, kind, name)
+    from twin.reporting import Reporter
+
+    with Reporter() as report:
+
+        def tell(stage: str, done: float) -> None:
+            interrupt.stop_if_asked()
+            report(stage, done)
+
+        target = export.export(
+            design, inclusion, levels, kind, name, quality=arguments.quality, progress=tell
+        )
+    print(f"file: {target}")
+
+
+def _pressed(arguments: argparse.Namespace) -> Design:
+    design = load_design(arguments.design)
+    return design.pressed(
+        mechanics=arguments.mechanics, tilt_deg=arguments.tilt, position_mm=arguments.position
+    )
+
+
 def _inclusion(arguments: argparse.Namespace) -> fem.Inclusion | None:
     given = {name: getattr(arguments, name) for name in ("size", "depth", "modulus")}
-    for name, value in {**given, "offset": arguments.offset}.items():
+    for name, value in {**given, "offset": arguments.offset, "stretch": arguments.stretch}.items():
         if arguments.no_inclusion and value is not None:
             raise DesignError(f"--{name}", "it together with --no-inclusion", "one of them")
         if not arguments.no_inclusion and value is None and name in given:
             raise DesignError(f"--{name}", "nothing", "a finite number > 0 (or --no-inclusion)")
     if arguments.no_inclusion:
         return None
-    values = {**given, "offset": tuple(arguments.offset or (0.0, 0.0))}
+    values = {
+        **given,
+        "offset": tuple(arguments.offset or (0.0, 0.0)),
+        "stretch": tuple(arguments.stretch or (1.0, 1.0, 1.0)),
+    }
     try:
         return fem.Inclusion(**values)
     except ValidationError as error:
@@ -151,8 +192,7 @@ def _inclusion(arguments: argparse.Namespace) -> fem.Inclusion | None:
 
 def _with_flags(line: str) -> str:
     field, colon, rest = line.partition(":")
-    if field.startswith("inclusion.offset."):
-        field = "inclusion.offset"
+    field = re.sub(r"\.\d+$", "", field)  # one of a flag's several values
     return _FLAGS.get(field, field) + colon + rest
 
 

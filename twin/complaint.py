@@ -151,6 +151,8 @@ _BOUNDS = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "m
 
 def _in_words(schema: Mapping[str, Any], node: Mapping[str, Any] | None) -> str:
     node = _resolved(schema, node)
+    if "anyOf" in node:  # a value that may be left out
+        node = next((kind for kind in node["anyOf"] if kind.get("type") != "null"), node)
     if "enum" in node:
         return "one of " + ", ".join(repr(choice) for choice in node["enum"])
     match node.get("type"):

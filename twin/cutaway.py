@@ -1,4 +1,4 @@
-"""Panels of the overview sheet along y = 0: the cut through probe and tissue, and the profiles over x."""
+"""Panels of the overview sheet along x: the cut through probe and tissue, and the profiles of the surface."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
-from matplotlib.patches import Rectangle
+from matplotlib.patches import Polygon, Rectangle
 from matplotlib.ticker import MaxNLocator
 from matplotlib.tri import LinearTriInterpolator, Triangulation
 from numpy.typing import NDArray
@@ -21,11 +21,11 @@ LAYERS = ("#deebf7", "#9ecae1", "#4a90c4", "#2b6ca3", "#1f4e79")
 
 
 def draw_cut(axes: Axes, frame: Pictured, letter: str) -> None:
-    """Plane y = 0 in the probe's frame: glass at rest, chest wall pushed towards it, true to scale."""
+    """Cut through the middle of probe and inclusion, in the probe's frame, true to scale: glass at rest,
+    specimen pushed towards it. Nodes off the plane y = 0 are drawn where they are seen from the side."""
     design, mesh = frame.design, frame.cut
-    indentation = frame.press["indentation_mm"]
-    layers, slab = design.waveguide.layers, design.specimen
-    half, wide = design.waveguide.width_mm / 2, slab.width_mm / 2
+    layers = design.waveguide.layers
+    half = design.waveguide.width_mm / 2
     colours = np.array([TISSUE, INCLUSION, *(LAYERS[i % len(LAYERS)] for i in range(len(layers)))])
     material = np.asarray(mesh.cell_data["material"]).astype(int)
     if frame.inclusion is None:  # the mesh may keep its sphere of cells; the tissue has none
@@ -36,11 +36,12 @@ def draw_cut(axes: Axes, frame: Pictured, letter: str) -> None:
         PolyCollection(moved[quads(mesh)], facecolors=fill, edgecolors="#00000030", linewidths=0.2)
     )
     bottom = -sum(layer.thickness_mm for layer in layers)
-    glass, wall = design.glass.thickness_mm, slab.thickness_mm - indentation
+    glass, wall = design.glass.thickness_mm, _wall(frame, moved)
     edge: dict[str, Any] = {"edgecolor": INK, "lw": 0.5}
     axes.add_patch(Rectangle((-half, bottom - glass), 2 * half, glass, facecolor=GLASS, **edge))
     hatch: dict[str, Any] = {"facecolor": WALL, "edgecolor": "#9a9a9a", "hatch": "////", "lw": 0.5}
-    axes.add_patch(Rectangle((-wide, wall), 2 * wide, 2.5, **hatch))
+    away = 2.5 * _normal(wall)
+    axes.add_patch(Polygon([*wall, *(wall + away)[::-1]], closed=True, **hatch))
     for led in design.leds:
         if led.side not in ("+x", "-x"):
             continue
@@ -48,27 +49,61 @@ def draw_cut(axes: Axes, frame: Pictured, letter: str) -> None:
         face = half + (led.gap_mm if led.coupling == "air" else -led.gap_mm)
         corner = (min(sign * face, sign * (face + 0.8)), led.z_mm - led.diameter_mm / 2)
         axes.add_patch(Rectangle(corner, 0.8, led.diameter_mm, facecolor=LED, zorder=4, **edge))
-    low, high = bottom - glass - 2.6, slab.thickness_mm + 5.0
+    low, high = bottom - glass - 2.6, float(wall[:, 1].max()) + 7.0
+    left, right = moved[:, 0].min() - 3, max(moved[:, 0].max() + 6, half + 23.5)  # keeps the names inside
     box = axes.get_window_extent()
-    spare = max(0.0, (high - low) * box.width / box.height - (2 * wide + 9)) / 2  # keeps the names inside
-    axes.set_xlim(-wide - 3 - spare, wide + 6 + spare)
+    spare = max(0.0, (high - low) * box.width / box.height - (right - left)) / 2
+    axes.set_xlim(left - spare, right + spare)
     axes.set_ylim(low, high)
     _name_the_parts(axes, frame, bottom, wall)
     axes.set_aspect("equal", anchor="N")
     axes.set_xlabel("x, mm")
     axes.set_ylabel("z, mm (into the tissue)")
-    axes.set_title(f"{letter}  Cut at y = 0 under a press of {indentation:.2f} mm (deformation × 1)")
+    indentation = frame.press["indentation_mm"]
+    y = 0.0 if frame.inclusion is None else frame.inclusion.offset[1]
+    title = f"Cut at y = 0 under a press of {indentation:.2f} mm (deformation × 1)"
+    if y:
+        title = f"Cut through the inclusion (y = {y:g} mm), pressed {indentation:.2f} mm"
+    axes.set_title(f"{letter}  {title}")
 
 
-def _name_the_parts(axes: Axes, frame: Pictured, bottom: float, wall: float) -> None:
+def _wall(frame: Pictured, moved: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Ends of the chest wall's face, (2, 2) mm of x and z, by rising x; level but for a tilted press."""
+    points = np.asarray(frame.cut.points, float)
+    about_x, about_y = np.radians(frame.press["tilt_deg"])
+    # the specimen's depth axis in the frame of a probe that was turned about x, then y
+    deep = points @ [-np.sin(about_y), np.cos(about_y) * np.sin(about_x), np.cos(about_y) * np.cos(about_x)]
+    face = moved[deep > deep.max() - 1e-6 * np.ptp(deep)]
+    return face[[face[:, 0].argmin(), face[:, 0].argmax()]]
+
+
+def _normal(wall: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Unit normal of the chest wall in the cut, away from the probe."""
+    along = wall[1] - wall[0]
+    return np.array([-along[1], along[0]]) / np.hypot(*along)
+
+
+def _name_the_parts(axes: Axes, frame: Pictured, bottom: float, wall: NDArray[np.float64]) -> None:
     design = frame.design
     slab, glass = design.specimen, design.glass.thickness_mm
-    half, left = design.waveguide.width_mm / 2, -slab.width_mm / 2 + 1.5
-    axes.text(left, wall - 1.2, f"tissue {slab.modulus_kPa:g} kPa", va="top", fontsize=7.5)
+    half, left = design.waveguide.width_mm / 2, wall[0, 0] + 1.5
+    slope = (wall[1, 1] - wall[0, 1]) / (wall[1, 0] - wall[0, 0])
+    top = wall[0, 1] + min(0.0, 20 * slope)  # the name is about 20 mm long
+    axes.text(left, top - 1.2, f"tissue {slab.modulus_kPa:g} kPa", va="top", fontsize=7.5)
     paper: dict[str, Any] = {"facecolor": "white", "edgecolor": "none", "pad": 1.5}
-    axes.text(0, wall + 1.15, "chest wall (fixed)", ha="center", va="center", bbox=paper)
+    middle = wall.mean(axis=0) + 1.15 * _normal(wall)
+    turn = np.degrees(np.arctan(slope))
+    axes.text(
+        *middle,
+        "chest wall (fixed)",
+        ha="center",
+        va="center",
+        rotation=turn,
+        rotation_mode="anchor",
+        bbox=paper,
+    )
     at_rest = "drawn with the probe at rest; the chest wall comes down"
-    axes.text(0, slab.thickness_mm + 4.4, at_rest, fontsize=6.5, ha="center", va="top", color=FAINT)
+    axes.text(middle[0], wall[:, 1].max() + 6.4, at_rest, fontsize=6.5, ha="center", va="top", color=FAINT)
     if frame.inclusion is not None:
         _name_the_inclusion(axes, frame)
     parts, top = [], 0.0
@@ -88,7 +123,7 @@ def _name_the_parts(axes: Axes, frame: Pictured, bottom: float, wall: float) -> 
         axes.text(-half - 2, lit[0].z_mm, "LED", ha="right", va="center")
     below = f"camera {design.camera.distance_mm:g} mm below"
     axes.text(0, bottom - glass - 0.5, below, fontsize=6.5, ha="center", va="top", color=FAINT)
-    scale_bar(axes, left, bottom - glass + 0.4, 10.0, INK)
+    scale_bar(axes, min(left, -half - 14), bottom - glass + 0.4, 10.0, INK)
 
 
 def _name_the_inclusion(axes: Axes, frame: Pictured) -> None:
@@ -109,18 +144,24 @@ def _name_the_inclusion(axes: Axes, frame: Pictured) -> None:
 
 
 def draw_profiles(rows: Sequence[Axes], frame: Pictured, letter: str) -> None:
-    """Cause to effect along y = 0, in three rows: tared displacement, pressure, tared counts.
+    """Cause to effect along x, in three rows: tared displacement, pressure, tared counts.
 
-    Dots are the nodes of the mechanics; the picture is the mean of 17 rows.
+    Through the middle of the inclusion, or as near to it as the picture goes. Dots are nodes of the mechanics
+    that lie on the line; the picture is the mean of 17 rows.
     """
     data, signal, found = frame.surface.point_data, frame.design.signal, frame.inclusion
     points = np.asarray(frame.surface.points, float)
-    half = frame.design.waveguide.width_mm / 2
-    nodes = np.flatnonzero(np.abs(points[:, 1]) < 1e-6 * half)
+    half, camera = frame.design.waveguide.width_mm / 2, frame.design.camera
+    y = 0.0 if found is None else found.offset[1]
+    y = round(float(np.clip(y, -0.45 * camera.field_height_mm, 0.45 * camera.field_height_mm)), 2)
+    nodes = np.flatnonzero(np.abs(points[:, 1] - y) < 1e-6 * half)
     x = np.linspace(-half, half, 401)[1:-1]
 
+    def along(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return _along_x(frame, values, x, y)
+
     pushed = np.asarray(data["displacement_0"])[:, 2] - np.asarray(data["displacement"])[:, 2]
-    rows[0].plot(x, 1e3 * _along_x(frame, pushed, x), color=INCLUSION, lw=1.2)
+    rows[0].plot(x, 1e3 * along(pushed), color=INCLUSION, lw=1.2)
     rows[0].plot(points[nodes, 0], 1e3 * pushed[nodes], ".", color=INCLUSION, ms=2.5)
     _threshold(rows[0], signal.displacement_um, f"k = {signal.displacement_um:g} µm")
     rows[0].set_ylabel("pushed in\nµm, tared", fontsize=6.5)
@@ -128,19 +169,19 @@ def draw_profiles(rows: Sequence[Axes], frame: Pictured, letter: str) -> None:
     pressure, pressure_0 = (np.asarray(data[name], float) for name in ("pressure", "pressure_0"))
     if found is not None:
         line: dict[str, Any] = {"color": FAINT, "lw": 1.0, "ls": "--", "label": "without inclusion"}
-        rows[1].plot(x, _along_x(frame, pressure_0, x), **line)
+        rows[1].plot(x, along(pressure_0), **line)
     label = "with inclusion" if found is not None else "plain tissue"
-    rows[1].plot(x, _along_x(frame, pressure, x), color=PRESSURE, lw=1.2, label=label)
+    rows[1].plot(x, along(pressure), color=PRESSURE, lw=1.2, label=label)
     rows[1].plot(points[nodes, 0], pressure[nodes], ".", color=PRESSURE, ms=2.5)
     inner = np.abs(points[:, :2]).max(axis=1) < INNER * half
     rows[1].set_ylim(0, 1.15 * max(pressure[inner].max(), pressure_0[inner].max()))
     rows[1].set_ylabel("pressure\nkPa", fontsize=6.5)
-    rows[1].legend(fontsize=6, frameon=False, loc="lower center", ncols=2, handlelength=2.2, borderpad=0)
+    rows[1].legend(fontsize=6, frameon=False, loc="best", ncols=2, handlelength=2.2, borderpad=0)
 
     counts = np.asarray(frame.tared, np.float64)
-    middle, width = counts.shape[0] // 2, frame.design.camera.field_of_view_mm
-    band = counts[max(middle - 8, 0) : middle + 9].mean(axis=0)
-    columns = ((np.arange(counts.shape[1]) + 0.5) / counts.shape[1] - 0.5) * width
+    row = round((0.5 - y / camera.field_height_mm) * counts.shape[0])  # rows grow with -y
+    band = counts[max(row - 8, 0) : row + 9].mean(axis=0)
+    columns = ((np.arange(counts.shape[1]) + 0.5) / counts.shape[1] - 0.5) * camera.field_of_view_mm
     rows[2].plot(columns, uniform_filter1d(band, 5), color="#4d4d4d", lw=1.2)
     _threshold(rows[2], signal.counts, f"k = {signal.counts:g}")
     rows[2].set_ylabel("picture\ncounts, tared", fontsize=6.5)
@@ -152,11 +193,13 @@ def draw_profiles(rows: Sequence[Axes], frame: Pictured, letter: str) -> None:
         axes.spines[["top", "right"]].set_visible(False)
         axes.yaxis.set_label_coords(-0.085, 0.5)
         if found is not None:
-            ends = found.offset[0] - found.size / 2, found.offset[0] + found.size / 2
-            axes.axvspan(*ends, color=INCLUSION, alpha=0.08, lw=0)
+            radius = found.size * found.stretch[0] / 2
+            axes.axvspan(
+                found.offset[0] - radius, found.offset[0] + radius, color=INCLUSION, alpha=0.08, lw=0
+            )
         if axes is not rows[2]:
             axes.tick_params(labelbottom=False)
-    what = "What the inclusion adds, along y = 0 (shaded: inclusion)"
+    what = f"What the inclusion (shaded) adds along y = {y:g}{' mm' if y else ''}"
     rows[0].set_title(f"{letter}  {what if found is not None else 'Along y = 0, on plain tissue'}")
 
 
@@ -168,8 +211,10 @@ def _threshold(axes: Axes, level: float, text: str) -> None:
     axes.text(1.01, level, text, fontsize=6, va="center", color=FAINT, transform=place)
 
 
-def _along_x(frame: Pictured, values: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Values of the contact surface's nodes, interpolated at (x, 0); NaN beside the surface."""
+def _along_x(
+    frame: Pictured, values: NDArray[np.float64], x: NDArray[np.float64], y: float
+) -> NDArray[np.float64]:
+    """Values of the contact surface's nodes, interpolated at (x, y); NaN beside the surface."""
     points = np.asarray(frame.surface.points, float)
     field = LinearTriInterpolator(Triangulation(points[:, 0], points[:, 1], triangles(frame.surface)), values)
-    return np.ma.filled(field(x, np.zeros_like(x)), np.nan)
+    return np.ma.filled(field(x, np.full_like(x, y)), np.nan)

@@ -9,29 +9,28 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterable
+from dataclasses import replace
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 from pydantic.json_schema import GenerateJsonSchema
 
 import fem
-from fem.model import MAX_SLENDERNESS, Length, Modulus, Poisson
-from scenes.sensor import Camera, Glass, Guide, Led, RefractiveIndex, Sensor, Skin, Tissue, conflicts
+from fem.model import DomeRadius, Length, Modulus, Offset, Poisson, Sides, Tilt
+from scenes.sensor import Camera, Glass, Guide, Led, RefractiveIndex, Sensor, Skin, Tissue
 from twin.complaint import DesignError, from_validation, not_finite, shown
+from twin.conflicts import design_conflicts, inclusion_conflicts
 
 CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 MAX_STRAIN = 0.2
-"""Deepest press, as a share of the slab's thickness: at 6 mm into 30 mm finite strain changes it by 36 %;
-beyond that nothing here has been compared with an independent code."""
-
-MAX_THICKNESS_MM = 500.0
-"""Thickest waveguide, as `scenes.sensor.Guide` has it."""
+"""Deepest press, as a share of the slab's thickness, 6 mm into 30 mm: no deeper one has been compared with an
+independent code."""
 
 MIN_INDENTATION_MM = 1e-4
 """Smallest press: far below what any camera sees."""
@@ -39,6 +38,7 @@ MIN_INDENTATION_MM = 1e-4
 _ONE_LINE = r"^[^\x00-\x1f\x7f-\x9f]*$"
 
 Depth = Annotated[float, Field(ge=MIN_INDENTATION_MM, le=100.0)]
+Mechanics = Literal["finite", "linear"]
 
 
 @dataclass(frozen=True, config=CONFIG)
@@ -53,6 +53,10 @@ class Waveguide:
     refractive_index: Annotated[
         RefractiveIndex, Field(description="Refractive index of all layers at the light's wavelength.")
     ] = 1.4336
+    dome_radius_mm: Annotated[
+        DomeRadius,
+        Field(description="Radius of a domed contact surface with its apex in the middle, mm; none if flat."),
+    ] = None
 
     @property
     def thickness_mm(self) -> float:
@@ -71,12 +75,16 @@ class Light:
 
 @dataclass(frozen=True, config=CONFIG)
 class Specimen:
-    """The tissue: a slab with free sides, fixed to a flat chest wall at its far face."""
+    """The tissue: a slab fixed to a flat chest wall at its far face."""
 
     thickness_mm: Annotated[Length, Field(description="Thickness from contact surface to chest wall, mm.")]
     width_mm: Annotated[Length, Field(description="Side of the square slab, mm.")]
     modulus_kPa: Annotated[Modulus, Field(description="Young's modulus of the tissue, kPa.")]
     poisson: Annotated[Poisson, Field(description="Poisson's ratio of the tissue, up to 0.4999.")] = 0.49
+    sides: Annotated[
+        Sides,
+        Field(description="Sides of the slab: free, or symmetric, as if the tissue went on mirrored there."),
+    ] = "free"
     refractive_index: Annotated[RefractiveIndex, Field(description="Refractive index of the tissue.")] = 1.40
     albedo: Annotated[
         float,
@@ -100,6 +108,13 @@ class PressDepths:
             description="Depths that the glass moves towards the chest wall, mm.",
         ),
     ] = (2.0,)
+    tilt_deg: Annotated[
+        tuple[Tilt, Tilt],
+        Field(description="Turn of the sensor about x, then y, through the middle of its surface, degrees."),
+    ] = (0.0, 0.0)
+    position_mm: Annotated[
+        tuple[Offset, Offset], Field(description="Centre of the sensor minus that of the specimen, mm.")
+    ] = (0.0, 0.0)
 
 
 @dataclass(frozen=True, config=CONFIG)
@@ -137,6 +152,10 @@ class Design:
     description: Annotated[
         str, Field(max_length=1000, pattern=_ONE_LINE, description="One line for people.")
     ] = ""
+    mechanics: Annotated[
+        Mechanics,
+        Field(description="finite: neo-Hookean, finite strain; linear: small strain, as the paper has it."),
+    ] = "finite"
     light: Annotated[Light, Field(description="What light the LEDs give.")] = Light()
     glass: Annotated[Glass, Field(description="The rigid plate between waveguide and camera.")] = Glass()
     surface: Annotated[Skin, Field(description="The rough contact between waveguide and tissue.")] = Skin()
@@ -144,13 +163,14 @@ class Design:
     signal: Annotated[Signal, Field(description="The thresholds k of the scalars.")] = Signal()
 
     def __post_init__(self) -> None:
-        found = list(self._conflicts())
+        found = list(design_conflicts(self))
         if found:
             raise DesignError(found[0].field, found[0].received, found[0].allowed, more=len(found) - 1)
 
     def probe(self) -> fem.Probe:
         """Return the waveguide as the mechanics see it."""
-        return fem.Probe(width_mm=self.waveguide.width_mm, layers=self.waveguide.layers)
+        guide = self.waveguide
+        return fem.Probe(width_mm=guide.width_mm, layers=guide.layers, dome_radius_mm=guide.dome_radius_mm)
 
     def slab(self) -> fem.Slab:
         """Return the specimen as the mechanics see it."""
@@ -160,7 +180,35 @@ class Design:
             width_mm=tissue.width_mm,
             modulus_kPa=tissue.modulus_kPa,
             poisson=tissue.poisson,
+            sides=tissue.sides,
         )
+
+    def pose(self) -> fem.Pose:
+        """Return how the probe meets the specimen."""
+        return fem.Pose(tilt_deg=self.press.tilt_deg, position_mm=self.press.position_mm)
+
+    def pressed(
+        self,
+        *,
+        mechanics: str | None = None,
+        tilt_deg: Iterable[float] | None = None,
+        position_mm: Iterable[float] | None = None,
+    ) -> Design:
+        """Return the design with another way to press; what is None stays. Raises `DesignError`."""
+        pose = {"tilt_deg": _pair(tilt_deg), "position_mm": _pair(position_mm)}
+        changes = {name: value for name, value in pose.items() if value is not None}
+        if not changes and mechanics is None:
+            return self
+        try:
+            press = replace(self.press, **changes)
+        except ValidationError as error:
+            found = from_validation(error, changes, TypeAdapter(PressDepths).json_schema())
+            raise found.renamed(f"press.{found.field}") from None
+        given = {"press": press, **({} if mechanics is None else {"mechanics": mechanics})}
+        try:
+            return replace(self, **given)  # type: ignore[arg-type]
+        except ValidationError as error:
+            raise from_validation(error, given, design_schema()) from None
 
     def guide(self) -> Guide:
         """Return the waveguide as light sees it."""
@@ -192,58 +240,29 @@ class Design:
         return MAX_STRAIN * self.specimen.thickness_mm
 
     def check_inclusion(self, inclusion: fem.Inclusion) -> None:
-        """Raise `DesignError` if the inclusion leaves the slab or touches the chest wall."""
+        """Raise `DesignError` if the inclusion leaves the slab, or does not lie under the probe."""
         if not isinstance(inclusion, fem.Inclusion):
             raise DesignError("inclusion", shown(inclusion), "a twin.Inclusion, or None for plain tissue")
-        slab, size, depth = self.specimen, inclusion.size, inclusion.depth
-        if depth + size >= slab.thickness_mm:
-            what = (
-                f"a size and depth (to its top) that add up to less than {slab.thickness_mm:g} mm, "
-                f"where the chest wall is; {size:g} + {depth:g} mm reaches it"
-            )
-            raise DesignError(
-                "inclusion.size" if size > depth else "inclusion.depth", shown(max(size, depth)), what
-            )
-        reach = slab.width_mm / 2 - size / 2
-        if max(abs(part) for part in inclusion.offset) >= reach:
-            raise DesignError(
-                "inclusion.offset",
-                shown(tuple(inclusion.offset)),
-                f"less than {reach:g} mm in x and y (the inclusion stays within the slab's width)",
-            )
+        for conflict in inclusion_conflicts(self, inclusion):
+            raise conflict
 
     def check_indentation(self, indentation: float, field: str = "press.indentation_mm") -> None:
         """Raise `DesignError` if the press is not a depth in mm that the model can be trusted with."""
         if not MIN_INDENTATION_MM <= indentation <= self.max_indentation_mm:
-            raise DesignError(field, shown(indentation), f"{self._depth_in_words()}")
+            raise DesignError(field, shown(indentation), self.depth_in_words)
 
-    def _depth_in_words(self) -> str:
+    @property
+    def depth_in_words(self) -> str:
+        """What a press depth may be, for people."""
         return (
             f"a number >= {MIN_INDENTATION_MM:g} and <= {self.max_indentation_mm:g} mm "
             f"({MAX_STRAIN:.0%} of the specimen)"
         )
 
-    def _conflicts(self) -> Iterator[DesignError]:
-        thickness, slab = self.waveguide.thickness_mm, self.specimen
-        if thickness > MAX_THICKNESS_MM:
-            allowed = f"layers of at most {MAX_THICKNESS_MM:g} mm together"
-            yield DesignError("waveguide.layers", f"{thickness:g} mm", allowed)
-            return
-        widest = MAX_SLENDERNESS * slab.thickness_mm
-        if slab.width_mm > widest:
-            allowed = (
-                f"at most {MAX_SLENDERNESS:g} times its thickness, {widest:g} mm (else the mesh is coarse)"
-            )
-            yield DesignError("specimen.width_mm", shown(slab.width_mm), allowed)
-        for conflict in conflicts(self.guide(), self.leds, self.camera, self.surface):
-            field = conflict.field.replace("skin.", "surface.")
-            yield DesignError(field, shown(conflict.received), conflict.allowed)
-        if self.specimen.width_mm < self.waveguide.width_mm:
-            allowed = f"at least the waveguide's width of {self.waveguide.width_mm:g} mm"
-            yield DesignError("specimen.width_mm", shown(self.specimen.width_mm), allowed)
-        for number, depth in enumerate(self.press.indentation_mm):
-            if depth > self.max_indentation_mm:
-                yield DesignError(f"press.indentation_mm.{number}", shown(depth), self._depth_in_words())
+
+def _pair(given: Any) -> Any:
+    """Any kind of sequence as a tuple; what is none goes on as it is, to be refused by name."""
+    return tuple(given) if isinstance(given, Iterable) and not isinstance(given, str | bytes) else given
 
 
 _ADAPTER = TypeAdapter(Design)
@@ -311,8 +330,8 @@ def parse_design(data: dict[str, Any], source: str = "") -> Design:
     try:
         # As JSON, because only there does pydantic's strict mode take a table for a dataclass and a list for
         # a tuple while it still refuses "25" or true where a number belongs. JSON has no dates, and neither
-        # has a design: null is refused in their place.
-        return _ADAPTER.validate_json(json.dumps(data, default=lambda date: None), strict=True)
+        # has a design: true, which no field takes, is refused in their place.
+        return _ADAPTER.validate_json(json.dumps(data, default=lambda date: True), strict=True)
     except ValidationError as error:
         raise from_validation(error, data, schema).renamed(source=source) from None
 

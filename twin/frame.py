@@ -49,8 +49,9 @@ class Frame:
 
     design: Design
     inclusion: Inclusion | None
-    press: dict[str, float]
-    """``indentation_mm`` and ``force_N`` of the press on the specimen with its inclusion."""
+    press: dict[str, Any]
+    """``indentation_mm`` and ``force_N`` of the press on the specimen with its inclusion; the sensor's
+    ``position_mm`` on it and its ``tilt_deg``, [x, y] each."""
     seed: int
     image: NDArray[Any]
     """(rows, columns) counts, uint8, or uint16 above 8 bits."""
@@ -65,9 +66,10 @@ class Frame:
     surface: pyvista.PolyData
     """Contact surface, mm, with the point arrays of `fem.press`."""
     cut: pyvista.PolyData
-    """Cut y = 0 through probe and slab, mm, with the arrays of `fem.press`."""
+    """Cut through the middle of probe and inclusion along x, mm, with the arrays of `fem.press`."""
     fem: dict[str, Any] = field(default_factory=dict)
-    """Scalars ``raw`` and ``tared`` of the surface, ``min_pressure_kPa``, ``dof`` and ``seconds``."""
+    """Scalars ``raw`` and ``tared`` of the surface, ``min_pressure_kPa``, ``path``, ``mechanics``,
+    ``error_percent``, ``dof`` and ``seconds``, as `fem.Press` explains them."""
     tsis: dict[str, Any] = field(default_factory=dict)
     """Scalars ``raw`` and ``tared`` of the picture, ``seconds``, ``noise_percent``, ``saturated_percent``."""
 
@@ -80,9 +82,8 @@ class Frame:
         """Return what `frame.json` says of the frame, but for the checksums of its files."""
         inclusion = None
         if self.inclusion is not None:
-            names = {"size": "size_mm", "depth": "depth_mm", "modulus": "modulus_kPa", "offset": "offset_mm"}
-            values = asdict(self.inclusion)
-            inclusion = {names[key]: values[key] for key in names}
+            units = {"size": "size_mm", "depth": "depth_mm", "modulus": "modulus_kPa", "offset": "offset_mm"}
+            inclusion = {units.get(key, key): value for key, value in asdict(self.inclusion).items()}
         return {
             "inclusion": inclusion,
             "press": self.press,

@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colorbar import Colorbar
 from matplotlib.colors import Normalize
-from matplotlib.patches import Circle, Rectangle
+from matplotlib.patches import Ellipse, Rectangle
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, zoom
@@ -35,9 +35,9 @@ class Pictured(Protocol):
     @property
     def design(self) -> Any: ...
     @property
-    def inclusion(self) -> Any: ...  # None, or size, depth, modulus, offset
+    def inclusion(self) -> Any: ...  # None, or size, depth, modulus, offset, stretch
     @property
-    def press(self) -> Mapping[str, float]: ...  # indentation_mm, force_N
+    def press(self) -> Mapping[str, Any]: ...  # indentation_mm, force_N, position_mm, tilt_deg
     @property
     def seed(self) -> int: ...
     @property
@@ -81,7 +81,7 @@ def draw_pressure(axes: Axes, frame: Pictured, letter: str) -> None:
     camera, width_mm = frame.design.camera, frame.design.waveguide.width_mm
     half = width_mm / 2
     smooth = resample(frame.surface, width_mm)
-    pressure = smooth.pressure_kPa
+    pressure = np.maximum(smooth.pressure_kPa, 0.0)  # the spline swings below zero where contact ends
     inside = np.abs(smooth.nodes_mm) < INNER * half
     top = float(pressure[np.ix_(inside, inside)].max())
     drawn = axes.imshow(
@@ -156,6 +156,7 @@ def draw_tared(axes: Axes, frame: Pictured, letter: str) -> None:
         lines.append(f"solid: {k:g} counts")
     if frame.inclusion is not None:
         _outline(axes, frame, INK)
+        axes.set(xlim=extent[:2], ylim=extent[2:])  # whatever of the inclusion lies beyond the picture
         lines.append("dashed: inclusion")
     scale_bar(axes, extent[0] + 1, extent[2] + 1, 5.0, INK)
     axes.set_xticks([])
@@ -209,7 +210,8 @@ def _outline(axes: Axes, frame: Pictured, colour: str) -> None:
     found = frame.inclusion
     if found is not None:
         centre = (float(found.offset[0]), float(found.offset[1]))
-        axes.add_patch(Circle(centre, found.size / 2, fill=False, edgecolor=colour, lw=1.0, ls=DASHED))
+        widths = found.size * found.stretch[0], found.size * found.stretch[1]
+        axes.add_patch(Ellipse(centre, *widths, fill=False, edgecolor=colour, lw=1.0, ls=DASHED))
 
 
 def _led_marks(axes: Axes, frame: Pictured) -> None:

@@ -17,6 +17,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from scenes.exr import write_bytes
+from twin.captions import inclusion_in_words, mechanics_in_words
 from twin.cutaway import draw_cut, draw_profiles
 from twin.panels import (
     FAINT,
@@ -87,7 +88,7 @@ def draw_sheet(figure: Figure, frame: Pictured) -> None:
 
 
 _TITLE: dict[str, Any] = {"fontsize": 8, "fontweight": "bold", "va": "bottom"}
-_LINE = 0.1  # distance of the tables' lines, as a share of their height
+_LINE, _CLOSE = 0.1, 0.08  # distance of the two tables' lines, as a share of their height
 
 
 def _axes(
@@ -102,13 +103,17 @@ def _headline(figure: Figure, frame: Pictured) -> None:
     found = frame.inclusion
     what = "Plain tissue, no inclusion"
     if found is not None:
-        what = (
-            f"Inclusion {found.size:g} mm wide, {found.depth:g} mm deep (to its top), {found.modulus:g} kPa"
-        )
-        if any(found.offset):
-            what += f", off centre by ({found.offset[0]:g}, {found.offset[1]:g}) mm"
+        what = f"Inclusion {inclusion_in_words(found)}"
     what += f", pressed {frame.press['indentation_mm']:.2f} mm"
-    note = f"design {frame.design.name} · seed {frame.seed} · computed, not photographed"
+    notes = [f"design {frame.design.name}", f"seed {frame.seed}", "computed, not photographed"]
+    tilt, position = frame.press["tilt_deg"], frame.press["position_mm"]
+    if found is not None and any(found.offset):
+        notes.insert(0, f"inclusion off centre by ({found.offset[0]:g}, {found.offset[1]:g}) mm")
+    if any(position):
+        notes.insert(0, f"sensor at ({position[0]:g}, {position[1]:g}) mm of the specimen")
+    if any(tilt):
+        notes.insert(0, f"tilted by ({tilt[0]:g}, {tilt[1]:g})° about x and y")
+    note = " · ".join(notes)
     place = 30 / WIDTH_PX
     figure.text(place, 1 - 30 / HEIGHT_PX, what, fontsize=12, fontweight="bold", va="center")
     figure.text(place, 1 - 58 / HEIGHT_PX, note, color=FAINT, va="center", parse_math=False)
@@ -150,6 +155,8 @@ def _facts(axes: Axes, frame: Pictured, letter: str) -> None:
         ("indentation", f"{frame.press['indentation_mm']:.3f} mm"),
         ("force", f"{frame.press['force_N']:.4f} N"),
         ("lowest contact pressure", f"{fem['min_pressure_kPa']:.3f} kPa"),
+        ("mechanics", mechanics_in_words(fem)),
+        ("error estimate, tared surface", f"{fem['error_percent']:.2g} % of its maximum"),
         ("unknowns of the mechanics", _number(fem["dof"])),
         ("LEDs", _coupling(frame)),
         ("noise of the computed light", f"{tsis['noise_percent']:.2f} % of its mean (rms)"),
@@ -159,8 +166,8 @@ def _facts(axes: Axes, frame: Pictured, letter: str) -> None:
     if saturated is not None:
         facts.append(("saturated pixels", f"{saturated:.2f} %"))
     for i, (name, value) in enumerate(facts):
-        axes.text(0, 0.73 - _LINE * i, name)
-        axes.text(1, 0.73 - _LINE * i, value, ha="right")
+        axes.text(0, 0.73 - _CLOSE * i, name)
+        axes.text(1, 0.73 - _CLOSE * i, value, ha="right")
 
 
 def _coupling(frame: Pictured) -> str:

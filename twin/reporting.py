@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+from twin.captions import inclusion_in_words, mechanics_in_words
 from twin.frame import Frame
 
 SATURATED_PERCENT = 0.1
@@ -90,6 +91,8 @@ def summarise(frames: Sequence[Frame], out: Path) -> None:
     console = Console(highlight=False)
     console.print(table)
     console.print("tared: minus the same press without inclusion", soft_wrap=True)
+    for line in _trust(frames):
+        console.print(line, soft_wrap=True)
     for line in _warnings(frames):
         console.print(line, soft_wrap=True)
     folders = [out] if len(frames) == 1 else [out / f"{number:02d}" for number in range(len(frames))]
@@ -107,11 +110,31 @@ def _warnings(frames: Sequence[Frame]) -> Iterator[str]:
         yield "dark: no light reaches the camera; see flux_W of the leds"
 
 
+def _trust(frames: Sequence[Frame]) -> Iterator[str]:
+    """Yield how the mechanics were computed, and how far off the tared displacement may be."""
+    ways = [mechanics_in_words(frame.fem) for frame in frames]
+    for way in dict.fromkeys(ways):
+        where = ""
+        if len(set(ways)) > 1:
+            depths = (
+                f.press["indentation_mm"] for f, found in zip(frames, ways, strict=True) if found == way
+            )
+            where = " at " + ", ".join(f"{depth:.3g}" for depth in depths) + " mm"
+        yield f"mechanics: {way}{where}"
+    if frames[0].inclusion is not None:
+        worst = max(frame.fem["error_percent"] for frame in frames)
+        yield f"estimated error of the mesh: {worst:.2g} % of the tared displacement's maximum"
+
+
 def _title(frame: Frame) -> str:
     inclusion = frame.inclusion
-    if inclusion is None:
-        return f"{frame.design.name}, no inclusion"
-    return (
-        f"{frame.design.name}, inclusion {inclusion.size:g} mm across, top {inclusion.depth:g} mm deep, "
-        f"{inclusion.modulus:g} kPa"
-    )
+    title = f"{frame.design.name}, "
+    title += "no inclusion" if inclusion is None else f"inclusion {inclusion_in_words(inclusion)}"
+    tilt, position = frame.press["tilt_deg"], frame.press["position_mm"]
+    if inclusion is not None and any(inclusion.offset):
+        title += f", off centre by ({inclusion.offset[0]:g}, {inclusion.offset[1]:g}) mm"
+    if any(tilt):
+        title += f", tilted by ({tilt[0]:g}, {tilt[1]:g})°"
+    if any(position):
+        title += f", sensor at ({position[0]:g}, {position[1]:g}) mm"
+    return title

@@ -7,28 +7,25 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, SupportsIndex, TypedDict, Unpack, overload
+from typing import TYPE_CHECKING, Any, Literal, SupportsIndex, TypedDict, Unpack, overload
 
 import numpy as np
 
 import fem
 from estimation import scalars
-from fem.model import check as check_mechanics
+from twin import presses
 from twin.complaint import DesignError, shown
 from twin.design import Design, load_design
 from twin.frame import Frame
+from twin.presses import Mechanics, Quality
 
 if TYPE_CHECKING:
     from fem import Press
     from scenes import Renderer, Rendering
 
-Quality = Literal["preview", "standard", "reference"]
 Device = Literal["auto", "cpu", "cuda"]
 Progress = Callable[[str, float], None]
 """Called with the name of the stage that runs now and the share of all work that is done, 0 to 1."""
-
-MIN_FORCE_N = 1e-4
-"""Smallest press by force: far below what any camera sees."""
 
 REFERENCE_FRAMES = 16
 """Noisy frames whose mean is the camera's reference."""
@@ -39,12 +36,12 @@ _LIGHT, _PICTURE, _REFERENCE = range(3)
 
 @dataclass(frozen=True)
 class _Work:
-    """How much is done: mechanics once, then light for each level."""
+    """How much is done: mechanics of all levels, then light for each level."""
 
     progress: Progress
     levels: int
-    # Seconds that mechanics and one level's light take on two cores; only to estimate the time left.
-    mechanics: float = 6.0
+    # Seconds that the mechanics and one level's light take on two cores; only to estimate the time left.
+    mechanics: float
     light: float = 8.0
 
     def tell(self, stage: str, mechanics: float, levels: float = 0.0) -> None:
@@ -56,6 +53,9 @@ class _Work:
 class Options(TypedDict, total=False):
     """What `simulate` takes beside the press, for whichever form of it."""
 
+    mechanics: Mechanics | None
+    tilt: Sequence[float] | None
+    position: Sequence[float] | None
     quality: Quality
     seed: SupportsIndex
     device: Device
@@ -92,6 +92,9 @@ def simulate(
     indentation: float | Sequence[float] | None = None,
     *,
     force: float | Sequence[float] | None = None,
+    mechanics: Mechanics | None = None,
+    tilt: Sequence[float] | None = None,
+    position: Sequence[float] | None = None,
     quality: Quality = "standard",
     seed: SupportsIndex = 0,
     device: Device = "auto",
@@ -104,37 +107,39 @@ def simulate(
     design : a `Design`, the name of a shipped one, or the path of a TOML file.
     inclusion : what lies in the tissue; None for homogeneous tissue.
     indentation : depth that the glass moves towards the chest wall, mm; by default the first of the design.
-    force : force on the glass instead, N.
+    force : force on the glass instead, N, along the sensor's axis.
+    mechanics : "finite" strain or "linear" elasticity, instead of the design's.
+    tilt : turn of the sensor about x, then y, degrees, instead of the design's.
+    position : centre of the sensor minus that of the specimen, mm, instead of the design's.
     quality : "preview", "standard" or "reference", for mechanics and light alike.
-    seed : of the light's and the camera's random numbers. One level's frame does not depend on the others.
+    seed : of the light's and the camera's random numbers. One level's frame does not depend on the others,
+        but for the last digits of its mechanics, which are found on one way through all levels.
     device : "auto" (a CUDA GPU where there is one), "cpu" or "cuda".
 
     Raises
     ------
-    DesignError, fem.NotModelled, scenes.backend.BackendError
+    DesignError, fem.NotModelled, fem.NotConverged, scenes.sensor.NotModelled, scenes.backend.BackendError
         In one line: what was received and what is allowed.
     """
     design = design if isinstance(design, Design) else load_design(design)
-    levels, by_force, several = _levels(design, indentation, force)
+    design = design.pressed(mechanics=mechanics, tilt_deg=tilt, position_mm=position)
+    levels, by_force, several = presses.levels_of(design, indentation, force)
     check(design, inclusion, levels, by_force=by_force)
     seed = _seed(seed)
     from scenes import Renderer
 
     renderer = Renderer(design.sensor(), device=device)
-    work = _Work(progress or (lambda stage, done: None), len(levels))
+    work = _Work(progress or (lambda stage, done: None), len(levels), _seconds(design, len(levels)))
+    pressed = presses.solved(
+        design,
+        inclusion,
+        levels,
+        by_force=by_force,
+        quality=quality,
+        progress=lambda stage, share: work.tell("mechanics", share),
+    )
     frames = []
-    for number, level in enumerate(levels):
-        # The mechanics are linear and `fem.press` keeps its last solution: further levels only scale it.
-        press = fem.press(
-            design.probe(),
-            design.slab(),
-            inclusion,
-            **{"force" if by_force else "indentation": level},
-            quality=quality,
-            progress=lambda stage, share: work.tell("mechanics", share),
-        )
-        if by_force:
-            _check_depth(design, press, levels)
+    for number, (level, press) in enumerate(zip(levels, pressed, strict=True)):
         stage = "light" if len(levels) == 1 else f"light {number + 1} of {len(levels)}"
 
         def tell(share: float, stage: str = stage, number: int = number) -> None:
@@ -145,6 +150,11 @@ def simulate(
     return frames if several else frames[0]
 
 
+def _seconds(design: Design, levels: int) -> float:
+    """About what the mechanics take."""
+    return 6.0 if design.mechanics == "linear" else 30.0 + 10.0 * levels
+
+
 def check(
     design: Design,
     inclusion: fem.Inclusion | None,
@@ -153,14 +163,14 @@ def check(
     by_force: bool = False,
 ) -> None:
     """Raise, before any work is done, if the press cannot be simulated: levels are mm, or N ``by_force``."""
-    if inclusion is not None:
-        design.check_inclusion(inclusion)
-    check_mechanics(design.probe(), design.slab(), inclusion)
-    for level in levels:
-        if not by_force:
-            design.check_indentation(level)
-        elif not MIN_FORCE_N <= level < np.inf:
-            raise DesignError("press.force_N", shown(level), f"a finite number >= {MIN_FORCE_N:g} N")
+    from scenes.sensor import NotModelled
+
+    if design.waveguide.dome_radius_mm is not None:
+        raise NotModelled(
+            f"waveguide.dome_radius_mm: received {design.waveguide.dome_radius_mm:g}; not modelled: light in "
+            "a domed guide; allowed is a flat one, without this key (twin export presses domed ones)"
+        )
+    presses.check(design, inclusion, levels, by_force=by_force)
 
 
 def _seed(seed: SupportsIndex) -> int:
@@ -171,41 +181,6 @@ def _seed(seed: SupportsIndex) -> int:
     except TypeError:
         raise DesignError("seed", shown(seed), "an integer >= 0") from None
     return operator.index(seed)
-
-
-def _levels(
-    design: Design, indentation: float | Sequence[float] | None, force: float | Sequence[float] | None
-) -> tuple[list[float], bool, bool]:
-    """Return the press levels (mm or N), whether they are forces, and whether a list of frames is wanted."""
-    if indentation is not None and force is not None:
-        raise DesignError("press", "both indentation and force", "one of them")
-    given = force if force is not None else indentation
-    if given is None:
-        given = design.press.indentation_mm[0]
-    several = isinstance(given, Sequence) or np.ndim(given) > 0
-    field = "press.force_N" if force is not None else "press.indentation_mm"
-    try:
-        each = list(given) if several else [given]  # type: ignore[arg-type]
-        if isinstance(given, str | bytes) or any(isinstance(level, bool | np.bool_ | str) for level in each):
-            raise TypeError
-        if any(np.ndim(level) for level in each):
-            raise TypeError
-        levels = [float(level) for level in each]  # type: ignore[arg-type]
-    except (TypeError, ValueError):
-        raise DesignError(field, shown(given), "a number > 0, or a list of them") from None
-    if not levels:
-        raise DesignError(field, "no level", "at least one number > 0")
-    return levels, force is not None, several
-
-
-def _check_depth(design: Design, press: Press, forces: Sequence[float]) -> None:
-    """Raise `DesignError` if one of the forces presses deeper than is allowed; depth goes with force."""
-    deepest = design.max_indentation_mm
-    most = deepest * press.force_N / max(press.indentation_mm, press.indentation_0_mm)
-    for force in forces:
-        if force > most:
-            allowed = f"a number > 0 and <= {most:.4g} N, which presses {deepest:g} mm deep"
-            raise DesignError("press.force_N", shown(force), allowed)
 
 
 def _frame(
@@ -248,18 +223,22 @@ def _frame(
     return Frame(
         design=design,
         inclusion=inclusion,
-        press={"indentation_mm": press.indentation_mm, "force_N": press.force_N},
+        press=_how(design, press),
         seed=seed,
         image=image,
         reference=reference,
         radiance=lit.radiance,
-        pressure=lit.pressure,
+        # between nodes with and without contact the optics' spline swings below zero
+        pressure=np.maximum(lit.pressure, 0.0),
         displacement_z=lit.displacement_z,
         surface=press.surface,
         cut=press.cut,
         fem={
             **fem.scalars(press.surface, design.signal.displacement_um),
             "min_pressure_kPa": press.min_pressure_kPa,
+            "path": press.path,
+            "mechanics": press.mechanics,
+            "error_percent": press.error_percent,
             "dof": press.dof,
             "seconds": press.seconds,
         },
@@ -271,6 +250,16 @@ def _frame(
             "saturated_percent": _saturated_percent(design, image, lit.radiance),
         },
     )
+
+
+def _how(design: Design, press: Press) -> dict[str, Any]:
+    """Return depth, force and pose, as `frame.json` names them."""
+    return {
+        "indentation_mm": press.indentation_mm,
+        "force_N": press.force_N,
+        "position_mm": list(design.press.position_mm),
+        "tilt_deg": list(design.press.tilt_deg),
+    }
 
 
 def _saturated_percent(design: Design, image: np.ndarray, radiance: np.ndarray) -> float:

@@ -1,4 +1,4 @@
-"""A folder of results that appears whole or not at all.
+"""A folder or a file of results that appears whole or not at all.
 
 Everything is written to a hidden sibling and renamed into place at the end, so a full disk, a mistake or
 Ctrl-C leaves neither half a result nor a broken earlier one.
@@ -44,6 +44,47 @@ def staged(out: str | Path, is_ours: Callable[[Path], bool]) -> Iterator[Path]:
         shutil.rmtree(folder, ignore_errors=True)
         _remove_empty(made)
         raise
+
+
+@contextmanager
+def staged_file(name: str, field: str, suffix: str) -> Iterator[Path]:
+    """Yield the path to write a file at, which takes its place when the block ends well; see `staged`.
+
+    ``name`` must end in ``suffix``, and so does the path that is yielded. An earlier file is replaced; a
+    folder, or a place that cannot be written, is refused with a `DesignError` about ``field``.
+    """
+    target = check_file(name, field, suffix)
+    made: list[Path] = []
+    try:
+        made = _make_parents(target.parent)
+        _remove_abandoned(target)
+        folder = target.with_name(f".{target.name}.{os.getpid()}.part")
+        folder.mkdir()
+    except (OSError, ValueError) as error:
+        _remove_empty(made)
+        raise DesignError(field, shown(name), f"a file that can be made ({_reason(error)})") from None
+    try:
+        yield folder / target.name
+        os.replace(folder / target.name, target)
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        _remove_empty(made)
+        raise
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def check_file(name: str, field: str, suffix: str) -> Path:
+    """Return the absolute path of a file to write, or raise `DesignError`."""
+    target = Path(os.path.abspath(name))
+    if not name.endswith(suffix) or target.name == suffix:
+        raise DesignError(field, shown(name), f"the name of a file that ends in {suffix}")
+    try:
+        taken = target.exists() and not target.is_file()
+    except (OSError, ValueError) as error:
+        raise DesignError(field, shown(name), f"a file that can be made ({_reason(error)})") from None
+    if taken:
+        raise DesignError(field, f"{shown(name)}, which is not a file", f"a file that ends in {suffix}")
+    return target
 
 
 def _refuse_foreign(out: str | Path, target: Path, is_ours: Callable[[Path], bool]) -> None:

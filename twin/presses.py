@@ -1,0 +1,138 @@
+"""From a design and an inclusion to presses, one for each level: what can be pressed, and who computes it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+import fem
+from fem.model import check as check_mechanics
+from twin.complaint import DesignError, shown
+from twin.design import Design
+
+if TYPE_CHECKING:
+    from fem import Press
+
+Mechanics = Literal["finite", "linear"]
+Quality = Literal["preview", "standard", "reference"]
+
+MIN_FORCE_N = 1e-4
+"""Smallest press by force: far below what any camera sees."""
+
+# The force grows faster than the depth, and with an inclusion: only beyond this factor of what plain tissue
+# carries at small strain at the deepest press is it out of reach without a look.
+_SURELY_TOO_MUCH = 2.0
+
+
+def levels_of(
+    design: Design, indentation: float | Sequence[float] | None, force: float | Sequence[float] | None
+) -> tuple[list[float], bool, bool]:
+    """Return the press levels (mm or N), whether they are forces, and whether a list of answers is wanted.
+
+    Without a level it is the first of the design.
+    """
+    if indentation is not None and force is not None:
+        raise DesignError("press", "both indentation and force", "one of them")
+    given = force if force is not None else indentation
+    if given is None:
+        given = design.press.indentation_mm[0]
+    several = isinstance(given, Sequence) or np.ndim(given) > 0
+    field = "press.force_N" if force is not None else "press.indentation_mm"
+    try:
+        each = list(given) if several else [given]  # type: ignore[arg-type]
+        if isinstance(given, str | bytes) or any(isinstance(level, bool | np.bool_ | str) for level in each):
+            raise TypeError
+        if any(np.ndim(level) for level in each):
+            raise TypeError
+        levels = [float(level) for level in each]  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        raise DesignError(field, shown(given), "a number > 0, or a list of them") from None
+    if not levels:
+        raise DesignError(field, "no level", "at least one number > 0")
+    return levels, force is not None, several
+
+
+def check(
+    design: Design,
+    inclusion: fem.Inclusion | None,
+    levels: Sequence[float] = (),
+    *,
+    by_force: bool = False,
+) -> None:
+    """Raise, before any work is done, if it cannot be pressed: levels are mm, or N ``by_force``."""
+    if inclusion is not None:
+        design.check_inclusion(inclusion)
+    check_mechanics(design.probe(), design.slab(), inclusion, design.pose())
+    for level in levels:
+        if not by_force:
+            design.check_indentation(level)
+        elif not MIN_FORCE_N <= level < np.inf:
+            raise DesignError("press.force_N", shown(level), f"a finite number >= {MIN_FORCE_N:g} N")
+
+
+def solved(
+    design: Design,
+    inclusion: fem.Inclusion | None,
+    levels: Sequence[float],
+    *,
+    by_force: bool = False,
+    quality: Quality = "standard",
+    estimate: bool = True,
+    progress: Callable[[str, float], None] | None = None,
+) -> list[Press]:
+    """Return the presses by finite elements, one for each level, all found on one way down.
+
+    Raises
+    ------
+    DesignError, fem.NotModelled, fem.NotConverged
+        In one line.
+    """
+    if by_force:
+        _refuse_hopeless(design, levels)
+    try:
+        presses = fem.press(
+            design.probe(),
+            design.slab(),
+            inclusion,
+            **{"force" if by_force else "indentation": list(levels)},
+            mechanics=design.mechanics,
+            quality=quality,
+            tilt=design.press.tilt_deg,
+            position=design.press.position_mm,
+            estimate=estimate,
+            progress=progress,
+        )
+    except ValueError as error:
+        # what the mesh cannot follow comes as a plain ValueError in the same words
+        if type(error) is ValueError and ": received " in str(error):
+            raise fem.NotModelled(str(error)) from None
+        raise
+    if by_force:
+        _check_depth(design, presses, levels)
+    return presses
+
+
+def _refuse_hopeless(design: Design, forces: Sequence[float]) -> None:
+    """Raise `DesignError`, at the cost of a preview, where the force is far beyond the deepest press."""
+    probe = replace(design.probe(), dome_radius_mm=None)
+    depth = design.max_indentation_mm
+    flat = fem.press(probe, design.slab(), None, depth, mechanics="linear", quality="preview", estimate=False)
+    for force in forces:
+        if force > _SURELY_TOO_MUCH * flat.force_N:
+            raise _too_deep(design, force, flat.force_N)
+
+
+def _check_depth(design: Design, presses: Sequence[Press], forces: Sequence[float]) -> None:
+    """Raise `DesignError` if one of the forces presses deeper than is allowed."""
+    for force, press in zip(forces, presses, strict=True):
+        deepest = max(press.indentation_mm, press.indentation_0_mm)
+        if deepest > design.max_indentation_mm * (1 + 1e-9):
+            raise _too_deep(design, force, force * design.max_indentation_mm / deepest)
+
+
+def _too_deep(design: Design, force: float, most: float) -> DesignError:
+    allowed = f"a number > 0 and <= about {most:.3g} N, which presses {design.max_indentation_mm:g} mm deep"
+    return DesignError("press.force_N", shown(force), allowed)
