@@ -15,7 +15,7 @@ from fem.emulator import CENTRED, Emulator, Errors, amplitudes, features, lagran
 from fem.regression import Regression, regress
 from fem.sampling import Plan, contrast, geometry_at
 from fem.solver import one_thread
-from fem.solving import KNOTS, Progress, knots, run, solved
+from fem.solving import KNOTS, NotBuilt, Progress, knots, run, solved
 from fem.surface import line_weights
 
 Floats = NDArray[np.float64]
@@ -29,7 +29,7 @@ _HELD = 0.2  # share of the samples that the learning curve is measured on
 _IMAGES = 0.5  # how far beyond the symmetry planes images of the samples are learned, in largest offsets
 
 
-def build(
+def build_emulator(
     plan: Plan,
     folder: str | Path,
     *,
@@ -51,15 +51,15 @@ def build(
 
     Raises
     ------
-    ValueError
+    NotBuilt
         If the folder holds the samples of another plan, or too few samples were solved, in one line.
     """
     tell = progress or (lambda stage, fraction: None)
     if samples is None and minutes is None:
-        raise ValueError("samples, minutes: received neither; allowed is one of them or both")
+        raise NotBuilt("samples, minutes: received neither; allowed is one of them or both")
     for name, value in (("samples", samples), ("minutes", minutes), ("workers", workers)):
         if value is not None and not value > 0:
-            raise ValueError(f"{name}: received {value}; allowed are positive numbers")
+            raise NotBuilt(f"{name}: received {value}; allowed are positive numbers")
     seconds = None if minutes is None else 60 * minutes
     run(plan, Path(folder), samples, seconds, workers or os.cpu_count() or 1, tell)
     tell("fit", 0.0)
@@ -95,7 +95,7 @@ def fit(plan: Plan, folder: str | Path, samples: int | None = None) -> Emulator:
 
     Raises
     ------
-    ValueError
+    NotBuilt
         If there are too few.
     """
     known = _read(plan, Path(folder), "sample", samples)
@@ -132,7 +132,7 @@ def _read(plan: Plan, folder: Path, kind: str, first: int | None) -> _Samples:
     amplitudes."""
     found = list(solved(folder, kind, first))
     if len(found) < _FEWEST[kind]:
-        raise ValueError(
+        raise NotBuilt(
             f"samples: received {len(found)} {kind}s that were solved; allowed {_FEWEST[kind]} and more"
         )
     points = np.stack([f["point"] for f in found])
@@ -149,8 +149,9 @@ def _read(plan: Plan, folder: Path, kind: str, first: int | None) -> _Samples:
 def _read_background(plan: Plan, folder: Path) -> _Background:
     found = list(solved(folder, "background", None))
     if len(found) < KNOTS[0] * KNOTS[1]:
-        raise ValueError(
-            f"folder: received {folder}, which lacks the background; allowed is one that `build` filled"
+        raise NotBuilt(
+            f"folder: received {folder}, which lacks the background; "
+            "allowed is one that `build_emulator` filled"
         )
     shaped = [
         np.stack([f[name] for f in found]).reshape(*KNOTS, *found[0][name].shape)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -19,6 +20,11 @@ from fem.sampling import PLAN, Plan, background, refine, solve
 
 Floats = NDArray[np.float64]
 Progress = Callable[[str, float], None]
+
+
+class NotBuilt(ValueError):
+    """An emulator that cannot be built from what there is: one line says why."""
+
 
 SHARE = 8  # samples for each pair of a fine and a lean mesh
 _FIRST = 16  # pairs that come with one sample each
@@ -57,7 +63,7 @@ def run(
 
     Raises
     ------
-    ValueError
+    NotBuilt
         If the folder belongs to another plan.
     """
     start = time.monotonic()
@@ -98,7 +104,7 @@ def claim(plan: Plan, folder: Path) -> None:
         except ValueError:
             same = False
         if not same:
-            raise ValueError(
+            raise NotBuilt(
                 f"folder: received {folder}, which holds the samples of another plan; allowed an empty one"
             )
     else:
@@ -124,10 +130,8 @@ def _tasks(plan: Plan, folder: Path, samples: int | None) -> Iterator[tuple[str,
 
 
 def _alone() -> None:
-    """A worker leaves Ctrl-C to its parent, which ends it."""
-    import signal
-
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """Ctrl-C ends a worker at once and without a word; a solve that it was at leaves nothing."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def _work(plan_json: bytes, folder: str, kind: str, number: int) -> None:

@@ -11,7 +11,7 @@ import pytest
 from numpy.lib.format import write_array
 
 import fem
-from fem.emulating import build, fit
+from fem.emulating import build_emulator, fit
 from fem.emulator import Emulator, check, lagrange, resample, signal, unfold
 from fem.emulator_file import NotAnEmulator, load_emulator, save_emulator
 from fem.regression import Regression, regress
@@ -44,7 +44,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def emulator(folder: Path) -> Emulator:
-    return build(PLAN, folder, samples=SAMPLES, workers=2)
+    return build_emulator(PLAN, folder, samples=SAMPLES, workers=2)
 
 
 def grids(answer: object) -> dict[str, np.ndarray]:
@@ -217,15 +217,15 @@ def test_answer_is_fast(emulator: Emulator) -> None:
 def test_builds_resume_and_keep_apart(emulator: Emulator, folder: Path) -> None:
     """A second build solves nothing anew and gives the same numbers; another plan is refused the folder."""
     before = {place.name: place.stat().st_mtime_ns for place in folder.iterdir()}
-    again = build(PLAN, folder, samples=SAMPLES, workers=1)
+    again = build_emulator(PLAN, folder, samples=SAMPLES, workers=1)
     assert {place.name: place.stat().st_mtime_ns for place in folder.iterdir()} == before
     assert np.array_equal(again.rise.weights, emulator.rise.weights)
     with pytest.raises(ValueError, match="another plan"):
-        build(replace(PLAN, seed=4), folder, samples=SAMPLES)
+        build_emulator(replace(PLAN, seed=4), folder, samples=SAMPLES)
     with pytest.raises(ValueError, match="samples: received 5 samples"):
         fit(PLAN, folder, 5)
     with pytest.raises(ValueError, match="samples, minutes: received neither"):
-        build(PLAN, folder)
+        build_emulator(PLAN, folder)
 
 
 def test_file_gives_the_same_bytes_and_answers(emulator: Emulator, tmp_path: Path) -> None:

@@ -45,6 +45,16 @@ examples:
   twin export my-sensor.toml --no-inclusion --tilt 0 3 --mechanics linear --vtu tilted.vtu
 """
 
+_EMULATE = """\
+Learn the contact field of a design's sensor, so that a press takes milliseconds: solve many specimens
+around the design's, fit, and say how far held-out ones are off. What was solved is kept in FILE.npz.samples:
+the same command goes on with it, also after Ctrl-C.
+
+examples:
+  twin emulate tsis --mechanics linear --minutes 30 --out tsis.npz
+  twin emulate my-sensor.toml --samples 400 --workers 2 --out mine.npz
+"""
+
 _SCHEMA = """\
 Print the JSON schema of a design file. An editor that knows it completes and checks designs.
 
@@ -101,6 +111,17 @@ def _parser() -> Parser:
     export.add_argument("--vtu", metavar="FILE.vtu", help="volume results of one press, for ParaView")
     _add_quality_flag(export)
 
+    emulate = _verb(verbs, "emulate", "an emulator of a sensor's contact field", _EMULATE)
+    emulate.add_argument("design", metavar="DESIGN", nargs="?", default="tsis", help="name or TOML file")
+    _add_mechanics_flag(emulate)
+    emulate.add_argument(
+        "--minutes", type=number(above=0.0), metavar="MIN", help="time to solve for (default 30)"
+    )
+    emulate.add_argument("--samples", type=whole, metavar="N", help="stop at so many samples")
+    emulate.add_argument("--workers", type=whole, metavar="N", help="processes (default: all cores)")
+    emulate.add_argument("--seed", type=whole, default=0, metavar="N", help="of the samples (default 0)")
+    emulate.add_argument("--out", metavar="FILE.npz", help="the file to write")
+
     _verb(verbs, "schema", "the JSON schema of a design file", _SCHEMA)
     return parser
 
@@ -132,13 +153,17 @@ def _add_inclusion_flags(parser: Parser) -> None:
     parser.add_argument("--no-inclusion", action="store_true", help="homogeneous tissue")
 
 
-def _add_pose_flags(parser: Parser) -> None:
+def _add_mechanics_flag(parser: Parser) -> None:
     parser.add_argument(
         "--mechanics",
         type=choice(*MECHANICS),
         metavar="M",
         help=" or ".join(MECHANICS) + " strain (default: the design's)",
     )
+
+
+def _add_pose_flags(parser: Parser) -> None:
+    _add_mechanics_flag(parser)
     _add_pair(parser, "--tilt", "turn of the sensor about x, then y, degrees (default: the design's)")
     _add_pair(parser, "--position", "sensor's centre minus the specimen's, mm (default: the design's)")
 

@@ -1,4 +1,4 @@
-"""The command line: ``twin demo``, ``twin simulate``, ``twin export``, ``twin schema``.
+"""The command line: ``twin demo``, ``simulate``, ``export``, ``emulate`` and ``schema``.
 
 Exit status 0: done; 1: the machine failed (a full disk); 2: bad input, one line on stderr; 130: interrupted.
 Nothing slow is imported until the input has been checked.
@@ -100,6 +100,8 @@ def _run(arguments: argparse.Namespace) -> int:
         _simulate(arguments, design, inclusion, levels, by_force=bool(arguments.force))
     elif arguments.verb == "export":
         _export(arguments, _pressed(arguments), _inclusion(arguments))
+    elif arguments.verb == "emulate":
+        _emulate(arguments)
     else:
         parse(["--help"])
     return 0
@@ -160,6 +162,34 @@ def _export(arguments: argparse.Namespace, design: Design, inclusion: fem.Inclus
             design, inclusion, levels, kind, name, quality=arguments.quality, progress=tell
         )
     print(f"file: {target}")
+
+
+def _emulate(arguments: argparse.Namespace) -> None:
+    from twin.emulate import emulate, summary
+    from twin.reporting import Reporter
+
+    if arguments.out is None:
+        raise DesignError("--out", "nothing", "the file to write")
+    for flag in ("samples", "workers"):
+        if getattr(arguments, flag) == 0:
+            raise DesignError(f"--{flag}", "0", "an integer > 0")
+    design = load_design(arguments.design).pressed(mechanics=arguments.mechanics)
+    with Reporter() as report:
+
+        def tell(stage: str, done: float) -> None:
+            interrupt.stop_if_asked()
+            report(stage.rstrip(" 0123456789"), done)
+
+        built = emulate(
+            design,
+            arguments.out,
+            minutes=arguments.minutes,
+            samples=arguments.samples,
+            workers=arguments.workers,
+            seed=arguments.seed,
+            progress=tell,
+        )
+    print(summary(built, arguments.out))
 
 
 def _pressed(arguments: argparse.Namespace) -> Design:
