@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
@@ -100,31 +99,32 @@ def fit(plan: Plan, folder: str | Path, samples: int | None = None) -> Emulator:
     """
     known = _read(plan, Path(folder), "sample", samples)
     pairs = _read(plan, Path(folder), "pair", None)
-    pairs = replace(pairs, inputs=pairs.inputs[:, CENTRED])
     base = _read_background(plan, Path(folder))
     with one_thread():
         fitted = _fit(known, None)
-        finer = regress(pairs.inputs, pairs.rise), regress(pairs.inputs, pairs.tared)
-        found = _left_out(known, fitted, base, _fit)
-        gain = _left_out(pairs, finer, base, _fit_as_it_is)
-        curve = _curve(known, base)
-    errors = Errors(
-        known.points[:, 0], found[:, :2], found[:, 2:], np.column_stack([pairs.points[:, 0], gain]), curve
-    )
-    return Emulator(plan, base.x, base.unit, base.pressure, base.moved, *fitted, *finer, errors)
+        finer = regress(pairs.inputs[:, CENTRED], pairs.rise)
+        errors = _cross_validated(known, fitted, pairs, finer, base)
+    return Emulator(plan, base.x, base.unit, base.pressure, base.moved, *fitted, finer, errors)
 
 
-def _left_out(
-    known: _Samples, fitted: Pair, base: _Background, again: Callable[[_Samples, Known], Pair]
-) -> Floats:
-    """Errors (n, 4) of samples that are left out, some at a time, from a fit with the same lengths."""
+def _cross_validated(
+    known: _Samples, fitted: Pair, pairs: _Samples, finer: Regression, base: _Background
+) -> Errors:
+    """Errors of samples that are left out, some at a time, from fits with the same lengths."""
     lengths = tuple((f.lengths, f.noise) for f in fitted)
-    folds = np.arange(len(known.points)) % _FOLDS
-    found = np.empty((len(folds), 4))
+    found, gain = np.empty((len(known.points), 4)), np.empty((len(pairs.points), 2))
     for k in range(_FOLDS):
-        held = folds == k
-        found[held] = _errors(known.part(held), again(known.part(~held), lengths), base)
-    return found
+        held = np.arange(len(found)) % _FOLDS == k
+        found[held] = _errors(known.part(held), _fit(known.part(~held), lengths), base)
+        held = np.arange(len(gain)) % _FOLDS == k
+        rest = pairs.part(~held)
+        again = regress(rest.inputs[:, CENTRED], rest.rise, (finer.lengths, finer.noise))
+        out = pairs.part(held)
+        guess = again(out.inputs[:, CENTRED])
+        gain[held] = _missed(out, "rise", out.rise, guess, base, fitted[0](out.inputs))
+    inside = known.plan.inside(known.points)
+    sizes, found = known.points[inside, 0], found[inside]
+    return Errors(sizes, found[:, :2], found[:, 2:], gain, _curve(known, base))
 
 
 def _read(plan: Plan, folder: Path, kind: str, first: int | None) -> _Samples:
@@ -136,8 +136,11 @@ def _read(plan: Plan, folder: Path, kind: str, first: int | None) -> _Samples:
             f"samples: received {len(found)} {kind}s that were solved; allowed {_FEWEST[kind]} and more"
         )
     points = np.stack([f["point"] for f in found])
+    if kind == "pair":
+        points[:, 2:4] = 0.0
     scales = amplitudes(points[:, None], contrast(plan.ratios))  # each (n, moduli)
-    fields = [np.stack([f[name] for f in found]) for name in ("rise", "moved")]
+    none = np.zeros((1, len(plan.ratios), 0))  # pairs have no displacements
+    fields = [np.stack([f.get(name, none) for f in found]) for name in ("rise", "moved")]
     rise, tared = (
         f / s.reshape(len(f), 1, -1, *(1,) * (f.ndim - 3)) for f, s in zip(fields, scales, strict=True)
     )
@@ -158,10 +161,6 @@ def _read_background(plan: Plan, folder: Path) -> _Background:
         for name in ("unit", "pressure", "moved")
     ]
     return _Background(found[0]["x"], *shaped)
-
-
-def _fit_as_it_is(known: _Samples, lengths: Known) -> Pair:
-    return regress(known.inputs, known.rise, lengths[0]), regress(known.inputs, known.tared, lengths[1])
 
 
 def _fit(known: _Samples, lengths: Known | None) -> Pair:
@@ -197,28 +196,35 @@ def _with_images(known: _Samples) -> tuple[Floats, Floats, Floats]:
 
 
 def _errors(held: _Samples, fitted: Pair, base: _Background) -> Floats:
-    """Largest error and its root mean square, per cent of the maximum, of the tared pressure and the tared
-    displacement into the probe; the worst of all levels and moduli; (n, 4)."""
+    """Errors (n, 4) of the tared pressure, then of the tared displacement into the probe, as `_missed`."""
+    rise = _missed(held, "rise", held.rise, fitted[0](held.inputs), base)
+    return np.hstack([rise, _missed(held, "tared", held.tared, fitted[1](held.inputs), base)])
+
+
+def _missed(
+    held: _Samples, kind: str, true: Floats, guess: Floats, base: _Background, whole: Floats | None = None
+) -> Floats:
+    """Largest error and its root mean square, the worst of all levels and moduli, per cent of the maximum of
+    `whole`, by default of the true field; (n, 2). Fields (n, values) over their amplitude."""
     plan, n = held.plan, len(held.plan.grid())
     area = np.outer(line_weights(base.x), line_weights(base.x))
     area /= area.sum()
-    at, s = knots(plan), contrast(plan.ratios)
-    out = np.empty((len(held.points), 4))
-    guesses = fitted[0](held.inputs), fitted[1](held.inputs)
+    at = knots(plan)
+    out = np.empty((len(held.points), 2))
+    shape, axes = (-1, len(plan.ratios), n, n), 1 if kind == "rise" else 3
     for i, point in enumerate(held.points):
         onto = resample(plan, geometry_at(plan, point, 100.0), base.x)
         thick, soft = lagrange(at[0], 1 / point[4]), lagrange(at[1], float(np.log(point[5])))
-        unit = np.tensordot(soft, np.tensordot(thick, base.unit, 1), 1)
-        shape = len(plan.levels), len(s), n, n
-        pairs = [
-            (known[i].reshape(*shape, -1)[..., -1], guess[i].reshape(*shape, -1)[..., -1])
-            for known, guess in ((held.rise, guesses[0]), (held.tared, guesses[1]))
-        ]
-        for k, (true, guess) in enumerate(pairs):
-            field, miss = (onto[0] @ f @ onto[1].T * (unit if k == 0 else 1.0) for f in (true, guess - true))
-            top = np.abs(field).max(axis=(2, 3))
-            out[i, 2 * k] = 100 * (np.abs(miss).max(axis=(2, 3)) / top).max()
-            out[i, 2 * k + 1] = 100 * (np.sqrt((miss**2 * area).sum(axis=(2, 3))) / top).max()
+        unit = np.tensordot(soft, np.tensordot(thick, base.unit, 1), 1) if kind == "rise" else 1.0
+
+        def on_grid(field: Floats, onto: tuple[Floats, Floats] = onto, unit: Floats | float = unit) -> Floats:
+            up = field.reshape(*shape, axes)[..., -1]  # the pressure, or the displacement along z
+            return np.asarray(onto[0] @ up @ onto[1].T * unit)
+
+        miss = on_grid(guess[i] - true[i])
+        top = np.abs(on_grid((true if whole is None else whole)[i])).max(axis=(2, 3))
+        out[i, 0] = 100 * (np.abs(miss).max(axis=(2, 3)) / top).max()
+        out[i, 1] = 100 * (np.sqrt((miss**2 * area).sum(axis=(2, 3))) / top).max()
     return out
 
 
@@ -226,7 +232,7 @@ def _curve(known: _Samples, base: _Background) -> Floats:
     """Learning curve, as `Errors.curve`."""
     total = len(known.points)
     rest = np.arange(total) >= round((1 - _HELD) * total)
-    rest_thick = known.part(rest & (known.points[:, 0] >= 4.0))
+    rest_thick = known.part(rest & (known.points[:, 0] >= 4.0) & known.plan.inside(known.points))
     rows = []
     for share in (0.125, 0.25, 0.5, 1.0):
         count = round(share * int((~rest).sum()))

@@ -21,13 +21,13 @@ from fem.contact import line
 from fem.mesh import Geometry
 from fem.model import Inclusion, NotModelled, Probe, Slab
 from fem.regression import Regression
-from fem.sampling import Plan, clearance, contrast, lines, quadratic
+from fem.sampling import CLEARANCE, Plan, clearance, contrast, lines, quadratic
 from fem.solving import knots
 
 Floats = NDArray[np.float64]
 
 
-CENTRED = [0, 1, 4, 5]
+CENTRED = [0, 1, 4, 5, 6]
 """The inputs that are no offsets: all that the gain from a finer mesh depends on, in the mesh's
 coordinates."""
 
@@ -60,13 +60,14 @@ class Emulated:
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors of held-out samples, each left out of what was fitted; in per cent of the field's own maximum.
+    """Errors of the samples within the ranges, each left out of what was fitted, in per cent of the field's
+    own maximum.
 
     `pressure` and `displacement` are of the tared fields on the whole contact surface: largest, and root
-    mean square over the area; (n, 2). `size_mm` (n,) is the inclusion's. `finer` (p, 5): the same of the
-    gain from a finer mesh: size, then pressure and displacement. `curve` (rows, 6): number of samples, core
-    seconds they took, and of a common set of held-out samples with `size_mm` >= 4 the median and the 95th
-    percentile of the pressure's largest error, and of its root mean square.
+    mean square over the area; (n, 2). `size_mm` (n,) is the inclusion's. `finer` (p, 2): the same of what a
+    finer mesh adds to the tared pressure. `curve` (rows, 6): number of samples, core seconds they took, and
+    of a common set of held-out samples with `size_mm` >= 4 the median and the 95th percentile of the
+    pressure's largest error, and of its root mean square.
     """
 
     size_mm: Floats
@@ -98,8 +99,8 @@ class Emulator:
         ...).
     rise, tared
         What the inclusion adds, as `sampling.solve` gives it, over `amplitudes`.
-    finer_rise, finer_tared
-        What a finer mesh adds to them, as `sampling.refine` gives it, over `amplitudes`.
+    finer
+        What a finer mesh adds to the rise, as `sampling.refine` gives it, over `amplitudes`.
     errors
         From cross-validation.
     """
@@ -111,8 +112,7 @@ class Emulator:
     moved: Floats
     rise: Regression
     tared: Regression
-    finer_rise: Regression
-    finer_tared: Regression
+    finer: Regression
     errors: Errors
 
     def __call__(
@@ -271,18 +271,16 @@ def signal(emulator: Emulator, slab: Slab, inclusion: Inclusion, level: Floats) 
     folded = replace(inclusion, offset=(big, small))
     point = np.array([inclusion.size, inclusion.depth, big, small, slab.thickness_mm, slab.modulus_kPa])
     s = float(contrast(np.array(inclusion.modulus / slab.modulus_kPa)))
-    nodes = contrast(plan.ratios)
-    along = lagrange(nodes, s)
+    along = lagrange(contrast(plan.ratios), s)
     onto = resample(plan, Geometry(plan.probe, slab, folded), emulator.x)
     inputs, n = features(plan, point[None]), onto[0].shape[1]
-    coarse, finer = (emulator.rise, emulator.tared), (emulator.finer_rise, emulator.finer_tared)
-    parts = []
-    for scale, mostly, little in zip(amplitudes(point, s), coarse, finer, strict=True):
-        signal = np.outer(level, along).ravel() @ mostly(inputs).reshape(len(level) * len(along), -1)
-        parts.append(scale * (signal + along @ little(inputs[:, CENTRED]).reshape(len(along), -1)))
-    rise = onto[0] @ parts[0].reshape(n, n) @ onto[1].T
-    moved = parts[1].reshape(n, n, 3).transpose(2, 0, 1)
-    tared = np.stack([onto[0] @ part @ onto[1].T for part in moved], axis=-1)
+    weights, scales = np.outer(level, along).ravel(), amplitudes(point, s)
+    rise = weights @ emulator.rise(inputs).reshape(len(weights), -1)
+    rise += along @ emulator.finer(inputs[:, CENTRED]).reshape(len(along), -1)
+    moved = weights @ emulator.tared(inputs).reshape(len(weights), -1)
+    rise = scales[0] * (onto[0] @ rise.reshape(n, n) @ onto[1].T)
+    parts = scales[1] * moved.reshape(n, n, 3).transpose(2, 0, 1)
+    tared = np.stack([onto[0] @ part @ onto[1].T for part in parts], axis=-1)
     return unfold(rise, tared, (x, y))
 
 
@@ -309,15 +307,21 @@ def amplitudes(points: Floats, s: Floats | float) -> tuple[Floats, Floats]:
 
 
 def features(plan: Plan, points: Floats) -> Floats:
-    """Inputs of the regressions, each about -1 to 1; points (n, 6) as of `Plan.points`."""
+    """Inputs of the regressions (n, 7), each about -1 to 1: size, depth of the centre, offsets, thickness,
+    tissue and nearness of the chest wall; points (n, 6) as of `Plan.points`."""
     r = plan.ranges
-    logs = [np.log(np.array(pair)) for pair in (r.size_mm, r.depth_mm, r.thickness_mm, r.tissue_kPa)]
-    scaled = [
-        (np.log(points[:, k]) - pair.mean()) / (np.ptp(pair) / 2)
-        for k, pair in zip((0, 1, 4, 5), logs, strict=True)
-    ]
-    offsets = 2 * points[:, 2:4] / max(r.offset_mm, 1e-9) - 1
-    return np.stack([scaled[0], scaled[1], offsets[:, 0], offsets[:, 1], scaled[2], scaled[3]], axis=1)
+    size, depth, x, y, thickness, tissue = points.T
+    middle = (r.depth_mm[0] + r.size_mm[0] / 2, r.depth_mm[1] + r.size_mm[1] / 2)
+
+    def even(values: Floats, ends: tuple[float, float]) -> Floats:
+        low, high = np.log(ends)
+        return np.asarray((2 * np.log(values) - low - high) / (high - low))
+
+    columns = [even(size, r.size_mm), even(depth + size / 2, middle)]
+    columns += [2 * offset / max(r.offset_mm, 1e-9) - 1 for offset in (x, y)]
+    columns += [even(thickness, r.thickness_mm), even(tissue, r.tissue_kPa)]
+    columns.append(1.5 * np.log(2 * CLEARANCE / (thickness - size - depth)))
+    return np.stack(columns, axis=1)
 
 
 def resample(plan: Plan, geometry: Geometry, x: Floats) -> tuple[Floats, Floats]:

@@ -22,7 +22,7 @@ Floats = NDArray[np.float64]
 
 _FORMAT = 1
 _LARGEST = 512 * 2**20  # bytes of all arrays
-_REGRESSIONS = ("rise", "tared", "finer_rise", "finer_tared")
+_REGRESSIONS = ("rise", "tared", "finer")
 _GRIDS = ("x", "unit", "pressure", "moved")
 
 
@@ -110,14 +110,8 @@ def _checked(arrays: dict[str, NDArray[Any]]) -> Emulator:
     shapes = {"x": (m,), "unit": (*KNOTS, m, m), "pressure": (*KNOTS, levels, m, m)}
     shapes["moved"] = (*KNOTS, levels, m, m, 3)
     for name in _REGRESSIONS:
-        q = 4 if name.startswith("finer") else 6
-        values = (
-            (1 if name.startswith("finer") else levels)
-            * moduli
-            * n
-            * n
-            * (3 if name.endswith("tared") else 1)
-        )
+        q = 5 if name == "finer" else 7
+        values = (1 if name == "finer" else levels) * moduli * n * n * (3 if name.endswith("tared") else 1)
         shapes |= _shapes_of(arrays, name, q, values)
     points, pairs, rows = (len(arrays[f"errors.{k}"]) for k in ("size_mm", "finer", "curve"))
     shapes |= {
@@ -125,7 +119,7 @@ def _checked(arrays: dict[str, NDArray[Any]]) -> Emulator:
         "errors.pressure": (points, 2),
         "errors.displacement": (points, 2),
     }
-    shapes |= {"errors.finer": (pairs, 5), "errors.curve": (rows, 6)}
+    shapes |= {"errors.finer": (pairs, 2), "errors.curve": (rows, 6)}
     for name, shape in shapes.items():
         if arrays[name].shape != shape:
             raise ValueError(f"{name} has shape {arrays[name].shape}, not {shape}")

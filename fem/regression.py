@@ -68,10 +68,11 @@ def principal(fields: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     (k,)."""
     mean = fields.mean(axis=0)
     left, size, modes = np.linalg.svd(fields - mean, full_matrices=False)
-    left_out = 1 - np.cumsum(size**2) / (size**2).sum()
+    total = (size**2).sum() or 1.0  # fields that are all the same have none
+    left_out = 1 - np.cumsum(size**2) / total
     k = min(_MODES, int(np.searchsorted(-left_out, -_TINY)) + 1, max(1, len(fields) - 8))
     root = np.sqrt(len(fields))
-    return mean, modes[:k] * size[:k, None] / root, left[:, :k] * root, size[:k] / size[:k].sum()
+    return mean, modes[:k] * size[:k, None] / root, left[:, :k] * root, size[:k] / (size[:k].sum() or 1.0)
 
 
 def lengths(inputs: Floats, values: Floats, share: Floats) -> tuple[Floats, Floats]:
@@ -93,7 +94,7 @@ def lengths(inputs: Floats, values: Floats, share: Floats) -> tuple[Floats, Floa
         rest = rest - basis @ (basis.T @ rest)
         spread = np.log((rest**2).sum(axis=0) / free)
         size = 2 * np.log(np.diag(root)).sum() + 2 * np.log(np.abs(np.diag(corner))).sum()
-        return float(free * (share @ spread) / share.sum() + size)
+        return float(free * (share @ spread) / (share.sum() or 1.0) + size)
 
     start = np.append(np.full(q, np.log(3.0)), np.log(1e-5))
     found = minimize(unlikely, start, method="L-BFGS-B", bounds=[_BOUNDS[0]] * q + [_BOUNDS[1]])

@@ -36,7 +36,8 @@ Floats = NDArray[np.float64]
 
 _CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False)
 _BEYOND = 0.03  # by how much of a range the samples reach beyond it: at the ends, regression is worst
-_CLEARANCE = 4.0  # mm between inclusion and chest wall
+CLEARANCE = 4.0
+"""Least distance between inclusion and chest wall, mm."""
 
 LEAN = Resolution(arc=3, core=1, shell=3, above=3, below=1, edge=2, side=3, layer=1, backing=1)
 """Mesh of the samples. Its rise differs from 115 thousand unknowns in a quarter by what
@@ -143,6 +144,13 @@ class Plan:
                 if clearance(size, depth, thickness) >= 0:
                     yield np.array([size, depth, x, y, thickness, tissue])
 
+    def inside(self, points: Floats) -> NDArray[np.bool_]:
+        """Which of the points (n, 6) lie within the ranges, (n,)."""
+        r = self.ranges
+        pairs = (r.size_mm, r.depth_mm, (0.0, r.offset_mm), (0.0, r.offset_mm), r.thickness_mm, r.tissue_kPa)
+        low, high = np.array(pairs).T
+        return np.asarray(((points >= low) & (points <= high)).all(axis=1))
+
     def point(self, number: int) -> Floats:
         return next(islice(self.points(), number, None))
 
@@ -156,7 +164,7 @@ PLAN: TypeAdapter[Plan] = TypeAdapter(Plan)
 
 def clearance(size: float, depth: float, thickness: float) -> float:
     """Room left between an inclusion and the chest wall, less what an emulator wants there, mm."""
-    return thickness - _CLEARANCE - size - depth
+    return thickness - CLEARANCE - size - depth
 
 
 def logical_lines(res: Resolution) -> Floats:
@@ -219,12 +227,12 @@ def solve(plan: Plan, point: Floats) -> dict[str, Floats]:
 
 
 def refine(plan: Plan, point: Floats) -> dict[str, Floats]:
-    """What the finer mesh adds to `solve` at small strain under the probe's middle, where symmetry makes it
+    """What the finer mesh adds to the rise at small strain under the probe's middle, where symmetry makes it
     cheap.
 
     Returns
     -------
-    `rise` (1, moduli, n, n) and `moved` (1, moduli, n, n, 3): fine minus lean, at the lean mesh's nodes.
+    `rise` (1, moduli, n, n) as of `solve`, fine minus lean, at the lean mesh's nodes.
     """
     point = np.array([*point[:2], 0.0, 0.0, *point[4:]])
     plans = [replace(plan, mechanics="linear", resolution=res) for res in (plan.resolution, plan.fine)]
@@ -233,8 +241,7 @@ def refine(plan: Plan, point: Floats) -> dict[str, Floats]:
     nodes = [lines(p, geometry, p.grid())[0] for p in plans]
     onto = quadratic(nodes[1], nodes[0])
     rise = np.einsum("ai,lcij,bj->lcab", onto, fine["rise"], onto, optimize=True)
-    moved = np.einsum("ai,lcijk,bj->lcabk", onto, fine["moved"], onto, optimize=True)
-    return {"rise": rise - lean["rise"], "moved": moved - lean["moved"]}
+    return {"rise": rise - lean["rise"]}
 
 
 def background(plan: Plan, thickness: float, tissue: float) -> dict[str, Floats]:

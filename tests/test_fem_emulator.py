@@ -68,6 +68,11 @@ def test_gaussian_process_finds_a_smooth_function() -> None:
     assert errors[2] < 1e-4
 
 
+def test_what_never_changes_is_learned_too() -> None:
+    x = np.random.default_rng(1).uniform(-1, 1, (20, 2))
+    assert regress(x, np.full((20, 3), 4.0))(x[:5]) == pytest.approx(4.0)
+
+
 def test_quadratic_and_polynomial_weights_are_exact() -> None:
     nodes, at = np.array([-1.0, 0.5, 1.0, 2.0, 4.0]), np.linspace(-1, 4, 11)
     assert quadratic(nodes, at) @ (nodes**2 - nodes) == pytest.approx(at**2 - at)
@@ -85,9 +90,7 @@ def test_held_out_solves_are_met(emulator: Emulator) -> None:
         truth = solve(other, point)["rise"][0, 1]
         geometry = geometry_at(PLAN, point, float(PLAN.ratios[1] * point[5]))
         assert geometry.inclusion is not None
-        coarse = replace(
-            emulator, finer_rise=silent(emulator.finer_rise), finer_tared=silent(emulator.finer_tared)
-        )
+        coarse = replace(emulator, finer=silent(emulator.finer))
         guess, _ = signal(coarse, geometry.slab, geometry.inclusion, np.ones(1))
         onto = resample(PLAN, geometry, emulator.x)
         unit = np.tensordot(
