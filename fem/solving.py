@@ -6,6 +6,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -90,6 +91,8 @@ def run(
                 future.result()
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
+            for worker in multiprocessing.active_children():  # what they are at is left undone
+                worker.terminate()
             raise
     progress("solved", 1.0)
 
@@ -130,8 +133,16 @@ def _tasks(plan: Plan, folder: Path, samples: int | None) -> Iterator[tuple[str,
 
 
 def _alone() -> None:
-    """Ctrl-C ends a worker at once and without a word; a solve that it was at leaves nothing."""
+    """Ctrl-C ends a worker at once and without a word, and so does the end of its parent."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
 def _work(plan_json: bytes, folder: str, kind: str, number: int) -> None:

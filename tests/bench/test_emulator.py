@@ -30,9 +30,7 @@ def test_emulator_after_half_an_hour(tmp_path: Path) -> None:
     plan = plan_of(load_design("tsis").pressed(mechanics="linear"))
     built = build_emulator(plan, tmp_path, minutes=MINUTES, workers=WORKERS)
     errors = built.errors
-    print(
-        f"\n{len(errors.size_mm)} samples within the ranges, cross-validated, largest error in % of the maximum:"
-    )
+    print(f"\n{len(errors.size_mm)} samples within the ranges, left out in turn: largest error, %:")
     for name in ("pressure", "displacement"):
         for size, what in ((4.0, "d >= 4 mm"), (0.0, "d < 4 mm")):
             found = [errors.percentile(name, percent, size, kind) for kind in (0, 1) for percent in (50, 95)]
