@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 from skfem import ElementHex2, MeshHex2
 
-from fem.model import STRAIGHT, Inclusion, Pose, Probe, Slab
+from fem.model import STRAIGHT, Inclusion, NotModelled, Pose, Probe, Slab
 from fem.topology import Layout, Resolution, probe_topology, slab_topology
 
 Floats = NDArray[np.float64]
@@ -196,7 +196,7 @@ def morph_slab(layout: Layout, geometry: Geometry, shift: Floats | None = None) 
 
     Raises
     ------
-    ValueError
+    NotModelled
         If an element turns inside out.
     """
     res, box = layout.res, box_around(geometry)
@@ -297,7 +297,7 @@ def _checked(mesh: MeshHex2, name: str) -> MeshHex2:
     if det.min() <= 0:
         cell = int(det.min(axis=1).argmin())
         x, y, z = mesh.p[:, mesh.t[:, cell]].mean(axis=1)
-        raise ValueError(
+        raise NotModelled(
             f"mesh: received a geometry that turns an element of the {name} inside out "
             f"near ({x:.2f}, {y:.2f}, {z:.2f}) mm; allowed are inclusions with more room around them"
         )

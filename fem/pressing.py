@@ -209,7 +209,7 @@ def press(
     _known("mechanics", mechanics, MECHANICS)
     geometry = _geometry(probe, slab, inclusion, tilt, position)
     answers = _presses([geometry], levels, by_force, mechanics, mesh.QUALITIES[quality], estimate, progress)
-    found = next(iter(answers))
+    (found,) = answers
     return found if several else found[0]
 
 
@@ -289,7 +289,7 @@ def _presses(
     start = time.perf_counter()
     tell = progress or (lambda stage, fraction: None)
     tell("mesh", 0.0)
-    total = 2 + len(geometries) * (len(levels) + 1)
+    total = 1 + len(geometries) * (len(set(levels)) + 1)
     done = [0]
 
     def step(stage: str) -> None:
@@ -315,7 +315,6 @@ def _presses(
                     seconds = time.perf_counter() - start
                     found[level] = _press(geometry, states, mechanics, res, error, seconds)  # type: ignore[arg-type]
                     step(f"level {level:g}")
-                tell("done", min(1.0, done[0] / total))
                 yield [found[level] for level in levels]
             tell("done", 1.0)
     except Stuck as stuck:

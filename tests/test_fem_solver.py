@@ -2,31 +2,44 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 from threadpoolctl import threadpool_limits
 
-from fem import elasticity, mesh, solver
-from fem.mesh import Resolution
+from fem import elasticity, solver
+from fem.mesh import Geometry
 from fem.model import Inclusion, Layer, Probe, Slab
-from fem.system import System, system
+from fem.path import build as build_model
+from fem.topology import Resolution, materials
 
 SMALL = Resolution(arc=2, core=1, shell=1, above=1, below=1, edge=1, side=1, layer=1, backing=1)
 
 
+@dataclass(frozen=True)
+class System:
+    """The tied press: dofs of each element (m, 81), -1 where held; its material; order of elimination."""
+
+    dofs: np.ndarray
+    material: np.ndarray
+    tree: solver.Tree
+
+
 def build(poisson: float = 0.49, contrast: float = 20.0) -> tuple[System, np.ndarray]:
-    probe, slab, ball = Probe(25, (Layer(2, 27),)), Slab(30, 60, 5), Inclusion(10, 5, 5 * contrast)
-    sys = system(SMALL, 1)
-    box = mesh.box_around(ball, probe, slab)
-    modulus = np.array([5.0, 5 * contrast, 27.0])[sys.material]
-    ratio = np.full(len(sys.material), poisson)
-    cut = sys.slab_elements
-    parts = mesh.morph_slab(SMALL, box, probe, slab), mesh.morph_probe(SMALL, box, probe, slab)
-    slices = slice(0, cut), slice(cut, None)
-    pairs = zip(parts, slices, strict=True)
-    return sys, np.concatenate([elasticity.stiffness(m, modulus[s], ratio[s]) for m, s in pairs])
+    probe, slab = Probe(25, (Layer(2, 27),)), Slab(30, 60, 5)
+    geometry = Geometry(probe, slab, Inclusion(10, 5, 5 * contrast))
+    model = build_model(geometry, SMALL, finite=False)
+    tied = model.system(np.ones(model.nodes.tip.shape, dtype=bool))
+    dofs = tied.unknown[
+        (3 * model.nodes.cells[:, :, None] + np.arange(3)).reshape(len(model.nodes.cells), -1)
+    ]
+    material = materials(model.layout)
+    modulus = np.array([5.0, 5 * contrast, 27.0])[material]
+    matrices = elasticity.stiffness(model.quad, *elasticity.lame(modulus, np.full(len(material), poisson)))
+    return System(dofs, material, tied.tree), matrices
 
 
 @pytest.fixture(scope="module")

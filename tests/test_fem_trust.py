@@ -1,0 +1,44 @@
+"""The estimate of the discretisation error against the true one: that against a finer mesh."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from test_fem_convergence import REFINED
+
+import fem
+from fem.mesh import QUALITIES, Geometry
+from fem.path import Path, build, path
+from fem.topology import Resolution
+from fem.trust import discretisation_error, tared
+
+PROBE = fem.Probe(25, (fem.Layer(2, 27), fem.Layer(3, 61), fem.Layer(5, 156)))
+SLAB = fem.Slab(30, 60, 5)
+CASES = [(10, 5), (4, 6), (13, 4), (6, 8), (8, 3), (5, 10)]  # size, depth, mm
+
+
+def pair(geometry: Geometry, res: Resolution) -> tuple[Path, Path]:
+    model = build(geometry, res, False)
+    bare = path(geometry, model, False)
+    return path(geometry, model, True, bare), bare
+
+
+@pytest.mark.parametrize(
+    ("size", "depth"), [CASES[0], *(pytest.param(*c, marks=pytest.mark.slow) for c in CASES[1:])]
+)
+def test_estimate_is_near_the_true_error(size: float, depth: float) -> None:
+    """Within 0.5 and 3 times the true error, both relative to the largest tared displacement."""
+    geometry = Geometry(PROBE, SLAB, fem.Inclusion(size, depth, 100))
+    exact = tared(geometry, *pair(geometry, REFINED))
+    ratios = {}
+    for quality in ("preview", "standard"):
+        found = pair(geometry, QUALITIES[quality])
+        true = 100 * np.abs(tared(geometry, *found) - exact).max() / np.abs(exact).max()
+        ratios[quality] = discretisation_error(geometry, QUALITIES[quality], *found) / true
+        print(f"size {size} depth {depth} {quality}: true {true:.3f} %, ratio {ratios[quality]:.2f}")
+    assert all(0.5 < ratio < 3 for ratio in ratios.values())
+
+
+def test_nothing_to_see_has_no_error() -> None:
+    answer = fem.press(PROBE, SLAB, None, 1.0, mechanics="linear", quality="preview")
+    assert answer.error_percent == 0
