@@ -12,6 +12,7 @@ from fem.model import Inclusion, Layer, NotConverged, NotModelled, Pose, Probe, 
 from fem.scalars import scalars
 
 if TYPE_CHECKING:
+    from fem.ccx import deck
     from fem.emulating import build_emulator
     from fem.emulator import Emulated, Emulator
     from fem.emulator_file import load_emulator, save_emulator
@@ -33,6 +34,7 @@ __all__ = [
     "Probe",
     "Slab",
     "build_emulator",
+    "deck",
     "load_emulator",
     "press",
     "press_2d",
@@ -48,6 +50,7 @@ _LATER = {
     "Emulated": "emulator",
     "Emulator": "emulator",
     "Press": "pressing",
+    "deck": "ccx",
     "build_emulator": "emulating",
     "load_emulator": "emulator_file",
     "press": "pressing",

@@ -2,12 +2,15 @@
 
 Stored energy per undeformed volume
 
-    W = mu/2 (J^(-2/3) tr C - 3) + kappa/2 (J - 1)²,    mu = E / 2(1 + nu), kappa = E / 3(1 - 2 nu),
+    W = mu/2 (J^(-2/3) tr C - 3) + kappa/2 (J - 1)² + c/4 (J - 1)⁴,
 
-(Bonet and Wood 2008, section 6.5; [bonet2008]). The volumetric part is projected element by element onto
-1, x, y, z: a discontinuous linear pressure p, condensed out, which with quadratic displacements is stable up
-to incompressibility (Boffi, Brezzi and Fortin 2013, section 8.6; [boffi2013]) and leaves the displacements as
-the only unknowns. At zero displacement the tangent is the stiffness of linear elasticity.
+mu = E / 2(1 + nu), kappa = E / 3(1 - 2 nu) (Bonet and Wood 2008, section 6.5; [bonet2008]), c = min(kappa, 50
+mu). The quartic term is 1e-4 of the volumetric energy where J differs from 1 by 1 %; it is there for elements
+at the probe's corners, whose J strays by tens of per cent round a projection that is right, until they tear.
+The quadratic part is projected element by element onto 1, x, y, z: a discontinuous linear pressure p,
+condensed out, which with quadratic displacements is stable up to incompressibility (Boffi, Brezzi and Fortin
+2013, section 8.6; [boffi2013]) and leaves the displacements as the only unknowns. At zero displacement
+the tangent is the stiffness of linear elasticity.
 """
 
 from __future__ import annotations
@@ -21,6 +24,7 @@ from fem.quadrature import DOFS, NODES, Quadrature
 
 Floats = NDArray[np.float64]
 
+_GUARD = 50.0  # shear moduli at most
 _CHUNK = 128  # elements at a time: their temporaries stay in the cache
 
 
@@ -70,6 +74,11 @@ def _pressure(quad: Quadrature, part: slice, det: Floats, bulk: Floats) -> Float
     return bulk[:, None] * (volume[:, None] @ modes)[:, 0]
 
 
+def _guard(shear: Floats, bulk: Floats) -> Floats:
+    """c of the quartic volumetric energy, kPa."""
+    return np.minimum(bulk, _GUARD * shear)
+
+
 def _deviator(f: Floats, det: Floats, shear: Floats) -> tuple[Floats, Floats]:
     """Deviatoric Kirchhoff stress mu J^(-2/3) dev b (n, q, 3, 3) and mu J^(-2/3) tr b / 3 (n, q), kPa."""
     scale = shear[:, None] * det ** (-2 / 3)
@@ -103,8 +112,10 @@ def forces(quad: Quadrature, moved: Floats, shear: Floats, bulk: Floats) -> tupl
         gradient, f, inverse, det = _deform(quad, part, moved)
         stress, mean = _deviator(f, det, shear[part])
         pressure = _pressure(quad, part, det, bulk[part])
+        guard = _guard(shear[part], bulk[part])[:, None] * (det - 1) ** 3
         # half p (J - 1) integrates to the projected energy, since p is in the space projected onto
-        stored = 1.5 * (mean - shear[part][:, None]) + 0.5 * pressure * (det - 1)
+        stored = 1.5 * (mean - shear[part][:, None]) + (0.5 * pressure + 0.25 * guard) * (det - 1)
+        pressure += guard
         energy += float((quad.weight[part] * stored).sum())
         stress += (pressure * det)[..., None, None] * np.eye(3)
         # first Piola-Kirchhoff stress P = tau F^-T, weighted
@@ -156,7 +167,8 @@ def _stiffness(
     n, q = det.shape
     weight = quad.weight[part]
     stress, mean = _deviator(f, det, shear)
-    pressure = _pressure(quad, part, det, bulk) * det
+    pressure = (_pressure(quad, part, det, bulk) + _guard(shear, bulk)[:, None] * (det - 1) ** 3) * det
+    guard = 3 * _guard(shear, bulk)[:, None] * ((det - 1) * det) ** 2
     kind = out.dtype
     # spatial gradients g = F^-T grad N: (n, 27, 3, q), then flat as (n, 81, q), dof = 3 * node + axis
     spatial = np.einsum("nqba,nbiq->niaq", inverse, gradient, optimize=True)
@@ -170,8 +182,8 @@ def _stiffness(
     # (mean - pJ) g_ib g_ja
     crossed = (flat * (weight * (mean - pressure))[:, None].astype(kind)) @ flat.transpose(0, 2, 1)
     k = crossed.reshape(n, NODES, 3, NODES, 3).transpose(0, 1, 4, 3, 2).reshape(n, DOFS, DOFS)
-    # h_ia g_jb + g_ia h_jb with h = (-2/3 tau_dev + (pJ - 2/3 mean)/2) g
-    tensor = (-2 / 3) * stress + (0.5 * (pressure - (2 / 3) * mean))[..., None, None] * np.eye(3)
+    # h_ia g_jb + g_ia h_jb with h = (-2/3 tau_dev + (pJ - 2/3 mean + J² dq/dJ)/2) g
+    tensor = (-2 / 3) * stress + (0.5 * (pressure - (2 / 3) * mean + guard))[..., None, None] * np.eye(3)
     h = np.einsum("nqab,nibq->niaq", tensor * weight[..., None, None], spatial, optimize=True)
     mixed = h.reshape(n, DOFS, q).astype(kind) @ flat.transpose(0, 2, 1)
     k = k + mixed + mixed.transpose(0, 2, 1)

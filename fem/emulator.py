@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from fem import surface
-from fem.contact import line
+from fem.contact import recovery
 from fem.mesh import Geometry
 from fem.model import Inclusion, NotModelled, Probe, Slab
 from fem.regression import Regression
@@ -354,4 +354,4 @@ def _grid(x: tuple[float, ...]) -> pv.PolyData:
 @lru_cache(maxsize=4)
 def _weights(x: tuple[float, ...]) -> tuple[Floats, Floats]:
     along = np.array(x)
-    return np.outer(surface.line_weights(along), surface.line_weights(along)), line(along).recovery
+    return np.outer(surface.line_weights(along), surface.line_weights(along)), recovery(along)

@@ -5,6 +5,7 @@ The tangent is applied element by element and never assembled; a Cholesky factor
 (`fem.solver`) preconditions it, so that most Newton steps need no factorisation at all. Which pairs of
 contact nodes are closed is iterated around it (primal-dual active set: Hüeber and Wohlmuth 2005;
 [hueber2005]): closed pairs that pull are opened, open pairs that overlap are closed, until neither is left.
+At finite strain the slab's mesh and the contact's slopes are iterated with it (`fem.contact`).
 """
 
 from __future__ import annotations
@@ -17,11 +18,11 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import LinearOperator, cg
 
 from fem import elasticity, solver
-from fem.contact import Interface, Tie, tie
+from fem.contact import Tie
 from fem.elasticity import Inverted
-from fem.quadrature import DOFS, Quadrature
-from fem.system import Nodes, System, system
-from fem.topology import Layout
+from fem.meshed import Model
+from fem.quadrature import DOFS
+from fem.system import System
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -30,13 +31,17 @@ Ints = NDArray[np.int64]
 _TOLERANCE = 1e-9  # of the residual, relative to the reaction at the chest wall
 _FORCING = 1e-3  # to which conjugate gradients solve each Newton step
 _HALVINGS = 8  # of a Newton step at most
-_NEWTON = 25  # steps at most
+_NEWTON = 20  # steps at most
 _PATIENCE = 12  # steps after which the residual must have come down to a hundredth of the reaction
+_DAMPING, _STRONGEST = 0.05, 0.8  # share of the stiffness at rest added where the tangent is not definite
 _WORTH = 15  # iterations of conjugate gradients that are worth a new factor
 _CHUNK = 128  # element matrices made double at a time
-_TURNS, _RELAX = 5, 0.7
-_LOOSE = 3e-4  # tolerance while the tie still changes
-_TURN = 1e-3  # change of the contact's slope that is left, in shares of the largest force
+_TURNS = 12  # of the slab's mesh and the slopes at most
+_STRICT = 8  # turns after which the probe's edge may still want to move by more
+_MEMORY = 5  # turns that the next one is extrapolated from
+_SLIP, _RIM_SLIP = 2e-4, 2e-3  # mm by which the mesh may still want to move: inside, and at the probe's edge
+_OFF = 1e-4  # share of the largest force by which forces may still change
+_LOOSE = 3e-4  # tolerance while mesh and slopes still change
 _SETS = 40  # changes of the active set at most
 
 
@@ -44,50 +49,8 @@ class NotConverged(ArithmeticError):
     """Newton's method or the active set found no equilibrium in this step."""
 
 
-@dataclass(frozen=True)
-class Model:
-    """Probe and slab in real coordinates, without the moduli of the slab's contents."""
-
-    layout: Layout
-    sides: str
-    nodes: Nodes
-    interface: Interface
-    quad: Quadrature
-    place: Floats  # undeformed nodes, (nodes, 3) mm
-    shift: Floats  # of the slab's nodes under the probe's, within the slab's surface, (nx, ny, 2) mm
-    normal: Floats  # direction of the press in the probe's frame, (3,)
-    ball: NDArray[np.int64]  # elements of the inclusion
-    finite: bool  # finite strain with sliding contact, or linear elasticity
-
-    def chest(self, indentation: float) -> Floats:
-        """Displacements that are held, (nodes, 3) mm: the chest wall comes nearer by the indentation."""
-        moved = np.zeros_like(self.place)
-        moved[self.nodes.chest] = -indentation * self.normal
-        return moved
-
-    @property
-    def slab(self) -> Floats:
-        """1 at the slab's nodes, 0 at the probe's; (nodes, 1)."""
-        return (np.arange(len(self.place)) < self.nodes.slab)[:, None].astype(float)
-
-    @property
-    def share(self) -> int:
-        """How many times the part that is meshed makes up the whole."""
-        return 2 ** sum(self.layout.symmetric)
-
-    def system(self, closed: Bools) -> System:
-        return system(self.layout, self.sides, closed)
-
-    def settle(self, moved: Floats, closed: Bools, bond: Tie) -> None:
-        """Put the probe's closed nodes onto the slab's surface, in place."""
-        distance = bond.gap(self.place + moved)
-        moved[self.nodes.tip, 2] += np.where(closed, distance, 0.0)
-
-    def nodal(self, forces: Floats) -> Floats:
-        """Sum of element forces (m, 27, 3) at the nodes, (nodes, 3)."""
-        dofs = (3 * self.nodes.cells[:, :, None] + np.arange(3)).ravel()
-        total = np.bincount(dofs, weights=forces.ravel(), minlength=self.place.size)
-        return np.asarray(total, dtype=float).reshape(-1, 3)
+class Indefinite(NotConverged):
+    """A tangent that is not positive definite."""
 
 
 @dataclass(frozen=True)
@@ -129,6 +92,11 @@ class Stiffness:
             hit = self.other[np.minimum(at, len(self.other) - 1)] == elements
             found[hit] = self.instead[at[hit]]
         return found
+
+    def plus(self, share: float, other: Stiffness) -> Stiffness:
+        """The sum with a share of others."""
+        every = np.arange(len(self.matrices))
+        return Stiffness(self.matrices + np.float32(share) * other(every))
 
     def sheared(self, cells: Ints, slope: Floats) -> Stiffness:
         """In the unknowns x, y and z - G . (x, y) at each node; slope G (nodes, 2)."""
@@ -237,26 +205,35 @@ def equilibrium(body: Body, guess: State) -> State:
     NotConverged, Inverted
         The step was too long.
     """
-    model, state = guess.model, replace(guess, moved=guess.moved.copy())
-    held = model.nodes.held
-    state.moved[held] = np.where(held, model.chest(guess.indentation), 0.0)[held]
+    held, state = guess.model.nodes.held, replace(guess, moved=guess.moved.copy())
+    state.moved[held] = np.where(held, guess.model.chest(guess.indentation), 0.0)[held]
     seen: set[bytes] = set()
-    turns, held_fast = 0, not model.finite
+    turns, settled = 0, not guess.model.finite
+    known: list[tuple[Floats, Floats]] = []
     for _ in range(_SETS):
-        if not held_fast:
-            share = 1.0 if turns == 0 else _RELAX
-            state = replace(state, tie=tie(model.interface, model.place + state.moved, state.tie, share))
+        if not settled:
+            state = _realign(state, known)
             turns += 1
         before = state.force
-        state = _newton(body, state, _TOLERANCE if held_fast else _LOOSE)
-        off = float(np.abs(state.force - before).max(initial=0.0))
-        distance = state.tie.gap(model.place + state.moved)
+        state = _newton(body, state, _TOLERANCE if settled else _LOOSE)
+        distance = state.tie.gap(state.model.place + state.moved)
         pulls = state.closed & (state.force < 0)
         overlaps = ~state.closed & (distance < 0)
         if not (pulls.any() or overlaps.any()):
-            if held_fast:
+            if settled:
                 return state
-            held_fast = turns >= _TURNS or off <= _TURN * float(np.abs(state.force).max(initial=0.0))
+            wanted = np.abs(state.model.wanted(state.moved) - state.model.shift)
+            inner = state.model.interface.inner
+            change = np.abs(state.force - before) / max(float(np.abs(state.force).max()), 1e-300)
+            rim = (_SLIP, _OFF) if turns <= _STRICT else (_RIM_SLIP, np.inf)
+            settled = bool(
+                wanted[inner].max() <= _SLIP
+                and change[inner].max() <= _OFF
+                and wanted.max() <= rim[0]
+                and change.max() <= rim[1]
+            )
+            if turns > _TURNS and not settled:
+                raise NotConverged("the sliding contact does not settle")
             continue
         closed = (state.closed & ~pulls) | overlaps
         key = closed.tobytes()
@@ -268,31 +245,64 @@ def equilibrium(body: Body, guess: State) -> State:
             closed[at] = ~closed[at]
             key = closed.tobytes()
         seen.add(key)
+        known.clear()
         state = replace(state, closed=closed)
         body.effort.sets += 1
     raise NotConverged("the set of closed contact pairs does not settle")
 
 
+def _realign(state: State, known: list[tuple[Floats, Floats]]) -> State:
+    """Move the slab's mesh to where the probe's nodes stand now, and take their slopes.
+
+    The turns are accelerated (Anderson 1965; [anderson1965]): from 4 mm on, where the pressure is no longer
+    small against the tissue's modulus, plain ones would drift off to both sides of the answer.
+    """
+    model, place = state.model, state.model.place + state.moved
+    slope = model.interface.slope(place)
+    if not state.tie.slope.any():  # the first of all
+        return replace(state, tie=replace(state.tie, slope=slope))
+    now = np.concatenate([model.shift, state.tie.slope]).ravel()
+    asked = np.concatenate([model.wanted(state.moved), slope]).ravel() - now
+    known.append((now, asked))
+    answer = now + asked
+    if len(known) > 1:
+        x, f = (np.stack(part, axis=1) for part in zip(*known[-_MEMORY:], strict=True))
+        dx, df = np.diff(x, axis=1), np.diff(f, axis=1)
+        answer -= (dx + df) @ np.linalg.lstsq(df, asked, rcond=1e-8)[0]
+    shift, slope = answer.reshape(2, *slope.shape)
+    return replace(state, model=model.follow(shift), tie=replace(state.tie, slope=slope))
+
+
 def _newton(body: Body, start: State, tolerance: float) -> State:
-    """Equilibrium for a given set of closed pairs and slopes."""
+    """Equilibrium for a given set of closed pairs, mesh and slopes."""
     model, closed, moved, bond = start.model, start.closed, start.moved, start.tie
     sys = model.system(closed)
     tip, at_chest = model.nodes.tip, model.nodes.chest
     model.settle(moved, closed, bond)
     forces, energy = body.forces(model, moved)
-    renew = False
+    renew, damping = False, 0.0
     for turn in range(_NEWTON):
         normal = np.where(closed, forces[tip, 2], 0.0)
         residual = sys.gather(bond.hand_on(forces, normal))
         size, scale = float(np.linalg.norm(residual)), float(np.linalg.norm(forces[at_chest]))
         if size <= max(tolerance * scale, body.floor):
             return replace(start, moved=moved, force=-normal, chest=-forces[at_chest].sum(axis=0))
-        if turn >= _PATIENCE and size > 1e-2 * scale:
+        if turn >= _PATIENCE and damping == 0 and size > 1e-2 * scale:
             raise NotConverged("Newton's method does not come down")
-        matrices = body.tangent(model, moved)
-        factor = body.factor(sys, matrices, bond.slopes(len(moved)) if model.finite else None, renew)
-        change, steps, downhill = _solve(body, model, sys, bond, matrices, factor, -residual)
-        renew = model.finite and steps > _WORTH
+        tangent = body.tangent(model, moved)
+        slopes = bond.slopes(len(moved)) if model.finite else None
+        while True:
+            matrices = tangent if damping == 0 else tangent.plus(damping, body.rest)
+            try:
+                factor = body.factor(sys, matrices, slopes, renew)
+                change, steps, downhill = _solve(body, model, sys, bond, matrices, factor, -residual)
+                break
+            except (Indefinite, np.linalg.LinAlgError):
+                if not model.finite or damping >= _STRONGEST:
+                    raise
+                damping, renew = max(4 * damping, _DAMPING), True
+        renew = model.finite and (steps > _WORTH or damping > 0)
+        damping = damping / 4 if damping > _DAMPING else 0.0
         body.effort.newton += 1
         # far from equilibrium, no step may raise the energy (Armijo's rule); near it rounding would decide
         for cut in range(_HALVINGS):
@@ -333,7 +343,10 @@ def _solve(
 
     def apply(values: Floats) -> Floats:
         force = model.nodal(product(matrices, expand(values), model))
-        return sys.gather(bond.hand_on(force, np.where(sys.closed, force[tip, 2], 0.0)))
+        found = sys.gather(bond.hand_on(force, np.where(sys.closed, force[tip, 2], 0.0)))
+        if values @ found <= 0 < values @ values:
+            raise Indefinite("the tangent is not positive definite")
+        return found
 
     count = [0]
 
@@ -351,5 +364,5 @@ def _solve(
     )
     body.effort.cg += count[0]
     if failed:
-        raise NotConverged("the tangent is not positive definite")
+        raise Indefinite("the tangent is not positive definite")
     return expand(answer), count[0], float(load @ answer)

@@ -7,64 +7,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fem import elasticity, mesh
-from fem.contact import Interface, level, line
+from fem import elasticity
+from fem.contact import level
 from fem.elasticity import Inverted
-from fem.equilibrium import Body, Model, NotConverged, State, Stiffness, equilibrium, product
+from fem.equilibrium import Body, NotConverged, State, Stiffness, equilibrium, product
 from fem.mesh import Geometry
-from fem.quadrature import Quadrature, join, quadrature
-from fem.system import nodes
-from fem.topology import Resolution, materials
+from fem.meshed import Model, moduli
 
 Floats = NDArray[np.float64]
 
 _LONGEST = 1.0  # mm of indentation in one step
-_MANY = 4500  # elements from which on their stiffness is kept in single precision
-_SECANT, _FORCE = 25, 1e-9  # steps to find a force, and how well to meet it
+_SECANT, _FORCE = 25, 1e-6  # steps to find a force, and how well to meet it
 _CUTS = 9  # halvings of a step at most
-
-
-def build(geometry: Geometry, res: Resolution, finite: bool, shift: Floats | None = None) -> Model:
-    """Mesh a geometry; `shift` as in `mesh.morph_slab`."""
-    layout = geometry.layout(res)
-    slab, probe = mesh.morph_slab(layout, geometry, shift), mesh.morph_probe(layout, geometry)
-    found = nodes(layout, geometry.slab.sides)
-    place = np.hstack([slab.doflocs, probe.doflocs]).T
-    x, y = place[found.tip[:, 0], 0], place[found.tip[0], 1]
-    return Model(
-        layout,
-        geometry.slab.sides,
-        found,
-        Interface(found.contact, found.tip, line(x), line(y), layout.symmetric),
-        join([quadrature(slab), quadrature(probe)]),
-        place,
-        np.zeros((*found.tip.shape, 2)) if shift is None else shift,
-        mesh.rotation(geometry.pose.tilt_deg).T[:, 2],
-        np.flatnonzero(materials(layout) == 1),
-        finite,
-    )
-
-
-def follow(geometry: Geometry, model: Model, shift: Floats) -> Model:
-    """The same model with the slab's contact nodes moved within its surface, to where the probe's nodes
-    are."""
-    slab = mesh.morph_slab(model.layout, geometry, shift)
-    quad, place, cut = quadrature(slab), model.place.copy(), model.nodes.slab_cells
-    place[: model.nodes.slab] = slab.doflocs.T
-    probe = model.quad.part(np.arange(cut, model.quad.size))
-    fields = (np.concatenate([getattr(quad, f), getattr(probe, f)]) for f in ("inverse", "weight", "modes"))
-    return replace(model, quad=Quadrature(model.quad.nodes, *fields), place=place, shift=shift)
-
-
-def moduli(geometry: Geometry, model: Model, inclusion: bool) -> tuple[Floats, Floats]:
-    """Shear and bulk modulus of each element, kPa; the slab's own in place of the inclusion if it is left
-    out."""
-    probe, slab = geometry.probe, geometry.slab
-    inner = geometry.inclusion if inclusion and geometry.inclusion is not None else None
-    ball = (slab.modulus_kPa, slab.poisson) if inner is None else (inner.modulus, inner.poisson)
-    table = [(slab.modulus_kPa, slab.poisson), ball, *((la.modulus_kPa, la.poisson) for la in probe.layers)]
-    modulus, poisson = np.array(table).T[:, materials(model.layout)]
-    return elasticity.lame(modulus, poisson)
 
 
 @dataclass
@@ -76,8 +30,6 @@ class Path:
     states: list[State]
     beside: Path | None = None
     """The same press without inclusion: its states are where to begin, and give the mesh."""
-    slide: Floats | None = None
-    """How far the slab's contact nodes follow per mm of indentation, (nx, ny, 2)."""
     linear: Path | None = None
     """The same press in small strain."""
     _rate: Floats | None = None
@@ -120,7 +72,9 @@ class Path:
         """Extrapolate the path to an indentation, on the mesh that follows the slip expected there."""
         known = self._line(near, indentation)
         if len(known) == 1 and near.closed.all():
-            moved = near.moved + self.rate() * (indentation - near.indentation)
+            way = indentation - near.indentation
+            moved = near.moved + self.rate() * way
+            shift = near.model.wanted(moved)
         elif len(known) == 1 and near.model.finite:  # nothing touches yet: begin where small strain ends
             if self.linear is None:
                 small = replace(near.model, finite=False)
@@ -129,6 +83,7 @@ class Path:
             return replace(begun, model=near.model)
         elif len(known) == 1:  # the slab comes nearer as a whole
             moved = near.moved - (indentation - near.indentation) * near.model.normal * near.model.slab
+            shift = near.model.shift
         else:
             x = np.array([s.indentation for s in known])
             weights = [
@@ -136,8 +91,9 @@ class Path:
                 for i in range(len(x))
             ]
             moved = np.asarray(sum(w * s.moved for w, s in zip(weights, known, strict=True)))
+            shift = np.asarray(sum(w * s.model.shift for w, s in zip(weights, known, strict=True)))
         guess = replace(near, indentation=indentation, moved=moved)
-        return replace(guess, model=self._model(indentation)) if near.model.finite else guess
+        return replace(guess, model=near.model.follow(shift)) if near.model.finite else guess
 
     def by_force(self, force: float) -> State:
         """Equilibrium under a force along z on the part that is meshed, mN.
@@ -166,19 +122,6 @@ class Path:
             before, state = state, self.to(wish)
         raise NotConverged("press: no indentation found that gives the force")
 
-    def _model(self, indentation: float) -> Model:
-        """The mesh for an indentation: contact nodes of the slab where the linear solution slides them to."""
-        first = self.states[0]
-        if not first.closed.all() or not first.model.layout.res.side:
-            return first.model
-        if self.slide is None:
-            apart = self.rate()
-            apart = (apart[first.model.nodes.tip] - apart[first.model.nodes.contact])[..., :2]
-            # lines move as a whole: what a corner does alone is left to the mortar
-            along_x, along_y = apart[..., 0].mean(axis=1), apart[..., 1].mean(axis=0)
-            self.slide = np.stack(np.broadcast_arrays(along_x[:, None], along_y), axis=-1)
-        return follow(self.geometry, first.model, indentation * self.slide)
-
     def _line(self, near: State, indentation: float) -> list[State]:
         """Up to three states to extrapolate from, none of them nearer to the next than the way to go."""
         known, way = [near], abs(indentation - near.indentation)
@@ -206,13 +149,19 @@ class Path:
             scale = (other.indentation - self.states[0].indentation) / (
                 s.indentation - self.states[0].indentation
             )
-            difference = scale * (s.moved - o.moved)
+            difference, slip = scale * (s.moved - o.moved), scale * (s.model.shift - o.model.shift)
         elif other.closed.all() and self.states[0].closed.all():
             rates = [p.rate() for p in (self, self.beside)]
             difference = (rates[0] - rates[1]) * other.indentation
+            slip = other.model.interface.slip(difference)
         else:
-            difference = np.zeros_like(other.moved)
-        return replace(other, moved=other.moved + difference)
+            difference, slip = np.zeros_like(other.moved), np.zeros_like(other.model.shift)
+        guess = replace(other, moved=other.moved + difference)
+        return (
+            replace(guess, model=other.model.follow(other.model.shift + slip))
+            if other.model.finite
+            else guess
+        )
 
     def rate(self) -> Floats:
         """Displacements per mm of a linear press with all pairs closed, (nodes, 3) mm / mm."""
@@ -230,7 +179,9 @@ def path(geometry: Geometry, model: Model, inclusion: bool, beside: Path | None 
     """Start at first touch. `beside`: the path without inclusion, whose factor is shared."""
     shear, bulk = moduli(geometry, model, inclusion)
     if beside is None:
-        kind = np.float32 if model.finite or model.quad.size > _MANY else np.float64
+        # linear forces come from these matrices: single precision, amplified by the bulk modulus, would cost
+        # the balance of forces 1e-4 and more. Finite strain takes its forces from the energy.
+        kind = np.float32 if model.finite else np.float64
         rest = Stiffness(elasticity.stiffness(model.quad, shear, bulk, dtype=kind))
     else:
         ball = elasticity.stiffness(model.quad, shear[model.ball], bulk[model.ball], elements=model.ball)

@@ -15,8 +15,9 @@ from fem import mesh, surface, volume
 from fem.equilibrium import NotConverged as Stuck
 from fem.equilibrium import State
 from fem.mesh import Geometry
+from fem.meshed import build, moduli
 from fem.model import Inclusion, NotConverged, NotModelled, Pose, Probe, Slab, check
-from fem.path import build, moduli, path
+from fem.path import path
 from fem.solver import one_thread
 from fem.topology import Resolution, materials, probe_topology, slab_topology
 from fem.trust import discretisation_error
@@ -332,7 +333,7 @@ def _press(
     seconds: float,
 ) -> Press:
     model = states[0].model
-    contact, lowest = _contact(geometry, states, res.edge)
+    contact, lowest = _contact(geometry, states)
     nodes, layout = model.nodes, model.layout
     faces, elements = surface.cut_faces(slab_topology(layout))
     probe_faces, probe_elements = surface.cut_faces(probe_topology(layout))
@@ -364,7 +365,7 @@ def _press(
     )
 
 
-def _contact(geometry: Geometry, states: tuple[State, State], edge: int) -> tuple[pv.PolyData, float]:
+def _contact(geometry: Geometry, states: tuple[State, State]) -> tuple[pv.PolyData, float]:
     """The contact surface with its fields, and the smallest pressure on it, kPa."""
     nodes, half = states[0].model.nodes, states[0].model.layout.symmetric
     at = states[0].model.place[nodes.tip]
@@ -375,7 +376,7 @@ def _contact(geometry: Geometry, states: tuple[State, State], edge: int) -> tupl
     lowest = np.inf
     for suffix, state in zip(("", "_0"), states, strict=True):
         moved = state.moved[nodes.tip]
-        pressure = surface.pressure(np.maximum(state.force, 0.0), x, y, edge, state.closed)
+        pressure = surface.pressure(np.maximum(state.force, 0.0), x, y, state.closed)
         stretch = np.ones(pressure.shape)
         if state.model.finite:  # area that the deformed surface covers, seen along z
             stretch = np.linalg.det(state.model.interface.derivatives(at + moved)[..., :2])

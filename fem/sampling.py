@@ -26,8 +26,9 @@ from scipy.stats import qmc
 from fem import mesh
 from fem.equilibrium import State
 from fem.mesh import Geometry
+from fem.meshed import build
 from fem.model import Inclusion, Length, Poisson, Probe, Slab, check
-from fem.path import build, path
+from fem.path import path
 from fem.pressing import _contact
 from fem.solver import one_thread
 from fem.topology import Resolution
@@ -104,8 +105,11 @@ class Plan:
             )
 
         for name, res in (("resolution", self.resolution), ("fine", self.fine)):
-            if not all(1 <= number <= 32 for number in vars(res).values()):
+            cells = [number for part, number in vars(res).items() if part != "growth"]
+            if not all(1 <= number <= 32 for number in cells):
                 raise ValueError(f"{name}: received {res}; allowed are 1 to 32 cells along each part")
+            if not all(0.2 <= ratio <= 5 for ratio in res.growth):
+                raise ValueError(f"{name}: received {res}; allowed are cells that grow 0.2 to 5 times")
 
     def slab(self, thickness: float, modulus: float) -> Slab:
         return Slab(thickness, self.width_mm, modulus, self.poisson, self.sides)
@@ -261,7 +265,7 @@ def background(plan: Plan, thickness: float, tissue: float) -> dict[str, Floats]
         linear = path(geometry, build(geometry, res, False), False)
         state = linear.to(1.0)
         unit, moved, _, _ = _fields(geometry, (state, state), res)
-        contact, _ = _contact(geometry, (state, state), res.edge)
+        contact, _ = _contact(geometry, (state, state))
         x = np.unique(np.round(np.asarray(contact.points[:, 0], dtype=float), 9))
         found: dict[str, list[Floats]] = {"pressure": [unit], "moved": [moved]}
         if plan.mechanics == "finite":
@@ -284,7 +288,7 @@ def _fields(
     geometry: Geometry, states: tuple[State, State], res: Resolution
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Pressure (n, n) and displacement (n, n, 3) on the whole footprint, of both states; kPa, mm."""
-    contact, _ = _contact(geometry, states, res.edge)
+    contact, _ = _contact(geometry, states)
     n = round(contact.n_points**0.5)
     data = contact.point_data
     return (

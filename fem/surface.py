@@ -10,6 +10,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.linalg import spsolve
 from skfem import ElementHex2, MeshHex2
 
+from fem import edge
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
@@ -49,18 +51,17 @@ _CONSISTENT = np.array([[4.0, 2.0, -1.0], [2.0, 16.0, 2.0], [-1.0, 2.0, 4.0]]) /
 _SIMPSON = np.diag([1.0, 4.0, 1.0]) / 6
 
 
-def pressure(
-    reaction: Floats, x: Floats, y: Floats, edge: int, closed: NDArray[np.bool_] | None = None
-) -> Floats:
+def pressure(reaction: Floats, x: Floats, y: Floats, closed: NDArray[np.bool_] | None = None) -> Floats:
     """Nominal contact pressure from the nodal reactions on the grid of the footprint.
 
     The consistent load of a pressure p is M p, with M the mass matrix of the contact faces. Dividing by the
     lumped area instead leaves an alternating error of -0.2 p'' H² at an element's corners and +0.1 p'' H² at
     its middle, H its half length: 3 % of the tared peak at standard quality. Solving with M removes it, but
     rings next to the singularity at the probe's edge, and where contact ends. So M is consistent inside,
-    lumped (Simpson's rule) across the edge in the `edge` cells next to the probe's edge, and lumped around
-    open pairs and wherever it would still give a negative pressure. Its row sums are the lumped areas in any
-    case, so `pressure * area` sums to the force.
+    lumped (Simpson's rule) in the cell at the probe's edge, after the singular rise there has been taken out
+    (`fem.edge`; not where contact has opened anywhere along the edges), and lumped around open pairs and
+    wherever it would still give a negative pressure. Its row sums are the lumped areas in any case, so
+    `pressure * area` sums to the force.
 
     Parameters
     ----------
@@ -77,7 +78,15 @@ def pressure(
     """
     shape = reaction.shape
     cells = (shape[0] - 1) // 2, (shape[1] - 1) // 2
-    at_edge = [_edge_cells(line, edge) for line in (x, y)]
+    ends = [(bool(line[0] < -0.5 * line[-1]), True) for line in (x, y)]  # a symmetric half starts at 0
+    rise = np.zeros(shape)
+    if closed is None or closed.all():
+        rest, along_x = edge.split(reaction, x, ends[0])
+        rest, along_y = edge.split(rest.T, y, ends[1])
+        along_x, corners = edge.split(along_x.T, y, ends[1])
+        reaction = rest.T
+        rise = along_x.T / line_weights(y) + along_y.T / line_weights(x)[:, None] + corners.T
+    at_edge = [_edge_cells(len(line), end) for line, end in zip((x, y), ends, strict=True)]
     loose = np.zeros(cells, dtype=bool) if closed is None else _around(~closed)
     number = np.arange(reaction.size).reshape(shape)
     nine = np.stack(
@@ -92,18 +101,18 @@ def pressure(
         rows = np.broadcast_to(nine[..., :, None], mass.shape)
         whole = coo_matrix((mass.ravel(), (rows.ravel(), rows.swapaxes(-1, -2).ravel())))
         found = spsolve(whole.tocsc(), reaction.ravel()).reshape(shape)
-        low = found < 0
+        low = found + rise < 0
         if not low.any() or loose.all():
-            return np.maximum(found, 0.0) if loose.all() else np.asarray(found)
+            break
         loose = loose | _around(low)
-    return np.maximum(np.asarray(found), 0.0)
+    return np.maximum(np.asarray(found + rise), 0.0)
 
 
-def _edge_cells(line: Floats, edge: int) -> NDArray[np.bool_]:
-    """Cells of a line next to the probe's edge; on a symmetric half, only at its far end."""
-    count = (len(line) - 1) // 2
-    mask = np.arange(count) >= count - edge
-    return mask if line[0] > -0.5 * line[-1] else mask | mask[::-1]
+def _edge_cells(nodes: int, ends: tuple[bool, bool]) -> NDArray[np.bool_]:
+    """The cells at the probe's edge, of a line of so many nodes."""
+    cells = np.zeros((nodes - 1) // 2, dtype=bool)
+    cells[0], cells[-1] = ends
+    return cells
 
 
 def _around(nodes: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -28,10 +28,11 @@ class Resolution:
     shell: int  # shells between the inclusion and the box
     above: int  # layers between the contact surface and the box
     below: int  # layers between the box and the chest wall
-    edge: int  # between the box and the probe's edge, graded towards the edge
-    side: int  # between the probe's edge and the slab's side, graded towards the edge
+    edge: int  # between the box and the probe's edge
+    side: int  # between the probe's edge and the slab's side
     layer: int  # through the probe's contact layer
     backing: int  # through each of its other layers
+    growth: tuple[float, float] = (1.0, 1.6)  # of cells from the box to the probe's edge, and beyond it
 
     @property
     def rim(self) -> int:

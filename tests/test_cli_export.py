@@ -60,3 +60,16 @@ def test_a_folder_of_that_name_is_left_alone(tmp_path, capfd):
     (tmp_path / "b").write_text("mine")
     assert cli.main([*QUICK, "--vtu", str(tmp_path / "b" / "a.vtu")]) == 2
     assert "--vtu" in capfd.readouterr().err
+
+
+def test_decks_come_in_a_folder_of_their_own(tmp_path, capfd):
+    """Both decks and how to run them; written again over themselves, never over CalculiX's answers."""
+    folder = tmp_path / "new" / "decks"
+    for _ in range(2):
+        assert cli.main([*QUICK, "--ccx", str(folder)]) == 0
+        assert {path.name for path in folder.iterdir()} == {"with.inp", "without.inp", "README.txt"}
+    assert "ccx -i with" in (folder / "README.txt").read_text()
+    assert (folder / "with.inp").read_text() != (folder / "without.inp").read_text()
+    (folder / "with.dat").write_text("mine")
+    assert cli.main([*QUICK, "--ccx", str(folder)]) == 2
+    assert "--ccx" in capfd.readouterr().err and (folder / "with.dat").read_text() == "mine"

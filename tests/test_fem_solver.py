@@ -12,8 +12,8 @@ from threadpoolctl import threadpool_limits
 
 from fem import elasticity, solver
 from fem.mesh import Geometry
+from fem.meshed import build as build_model
 from fem.model import Inclusion, Layer, Probe, Slab
-from fem.path import build as build_model
 from fem.topology import Resolution, materials
 
 SMALL = Resolution(arc=2, core=1, shell=1, above=1, below=1, edge=1, side=1, layer=1, backing=1)

@@ -85,7 +85,7 @@ def test_a_sensor_off_the_middle_of_the_specimen_sees_the_mirror_image_at_the_ot
         (press,) = presses.solved(there, inclusion, [2.0], quality="preview", estimate=False)
         found.append(grid(press)[0])
     assert np.abs(found[0] - found[1][::-1]).max() < 1e-6 * found[0].max()
-    assert np.abs(found[0] - found[0][::-1]).max() > 0.3  # kPa: not the same as straight above the middle
+    assert np.abs(found[0] - found[0][::-1]).max() > 0.1  # kPa: not the same as straight above the middle
 
 
 def test_an_ellipsoid_is_told_and_its_stretch_of_one_is_the_sphere(tilted):
@@ -96,7 +96,7 @@ def test_an_ellipsoid_is_told_and_its_stretch_of_one_is_the_sphere(tilted):
 
 
 def test_finite_strain_raises_force_and_signal():
-    """At 1 mm the tared signal grows by about 10 % (issue 3); the two agree as the press goes to zero."""
+    """At 1 mm the tared signal grows by about 2 %; the two agree as the press goes to zero."""
     design = small()
     linear, finite = (
         {

@@ -38,11 +38,13 @@ examples:
 
 _EXPORT = """\
 Press a sensor on a slab of tissue and write the mechanics for other programs: displacement, stress and
-materials throughout as VTU, which ParaView opens. No light is computed. Lengths are mm, moduli kPa.
+materials throughout as VTU, which ParaView opens, or the same press, with and without the inclusion, as
+input decks of CalculiX. No light is computed. Lengths are mm, moduli kPa.
 
 examples:
   twin export --size 10 --depth 5 --modulus 100 --indentation 2 --vtu press.vtu
   twin export my-sensor.toml --no-inclusion --tilt 0 3 --mechanics linear --vtu tilted.vtu
+  twin export tsis --size 10 --depth 5 --modulus 100 --indentation 1 2 3 --ccx decks
 """
 
 _EMULATE = """\
@@ -101,14 +103,16 @@ def _parser() -> Parser:
     )
     _add_run_flags(simulate)
 
-    export = _verb(verbs, "export", "a press as a file for ParaView", _EXPORT)
+    export = _verb(verbs, "export", "a press as files for ParaView or CalculiX", _EXPORT)
     export.add_argument(
         "design", metavar="DESIGN", nargs="?", default="tsis", help="name or TOML file (default tsis)"
     )
     _add_inclusion_flags(export)
     _add_pose_flags(export)
     _add_depths(export)
-    export.add_argument("--vtu", metavar="FILE.vtu", help="volume results of one press, for ParaView")
+    kind = export.add_mutually_exclusive_group()
+    kind.add_argument("--vtu", metavar="FILE.vtu", help="volume results of one press, for ParaView")
+    kind.add_argument("--ccx", metavar="DIR", help="input decks for CalculiX, one step per press depth")
     _add_quality_flag(export)
 
     emulate = _verb(verbs, "emulate", "an emulator of a sensor's contact field", _EMULATE)

@@ -46,6 +46,7 @@ _FLAGS = {
     "press.position_mm": "--position",
     "mechanics": "--mechanics",
     "vtu": "--vtu",
+    "ccx": "--ccx",
     "out": "--out",
     "device": "--device",
 }
@@ -145,8 +146,13 @@ def _simulate(
 def _export(arguments: argparse.Namespace, design: Design, inclusion: fem.Inclusion | None) -> None:
     from twin import export
 
+    if arguments.ccx is not None:
+        levels = arguments.indentation or design.press.indentation_mm
+        folder = export.export_decks(design, inclusion, levels, arguments.ccx, quality=arguments.quality)
+        print(f"folder: {folder} (README.txt says how to run the decks)")
+        return
     if arguments.vtu is None:
-        raise DesignError("--vtu", "nothing", "the file to write")
+        raise DesignError("--vtu, --ccx", "nothing", "one of them, with what to write")
     kind: export.Kind = "vtu"
     name = arguments.vtu
     levels = arguments.indentation or design.press.indentation_mm

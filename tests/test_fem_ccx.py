@@ -1,0 +1,172 @@
+"""Independent code: presses of CalculiX on the decks of `fem.ccx`, in linear and in finite strain."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import ccx_runner
+import numpy as np
+import pytest
+from ccx_fetch import find
+
+import fem
+from fem import ccx
+from fem.mesh import Geometry
+from fem.model import Pose
+from fem.topology import Resolution
+
+needs_ccx = pytest.mark.skipif(
+    find() is None, reason="CalculiX (ccx) is neither installed nor in .ccx: make setup"
+)
+
+PROBE = fem.Probe(25, (fem.Layer(2, 27), fem.Layer(3, 61), fem.Layer(5, 156)))
+SLAB = fem.Slab(30, 60, 5)
+# Few cells at the probe's edge: CalculiX loses equilibrium at finer ones, whose corners fold up. They move
+# the tared maximum of a linear press by 0.2 %.
+COARSE_EDGE = Resolution(arc=3, core=1, shell=3, above=3, below=2, edge=2, side=2, layer=2, backing=1)
+# Its totals of a linear press need fine ones.
+FINE_EDGE = Resolution(4, 1, 4, 3, 2, edge=3, side=4, layer=3, backing=1, growth=(1 / 1.7, 2.2))
+INCLUSIONS = [
+    fem.Inclusion(10, 5, 100),
+    fem.Inclusion(13, 6, 40),
+    fem.Inclusion(8, 4, 120, (3, 0)),
+    fem.Inclusion(10, 7, 60, (2, -3)),
+]
+
+
+def compared(
+    folder: Path,
+    geometry: Geometry,
+    levels: list[float],
+    mechanics: ccx.Mechanics,
+    quality: str,
+    res: Resolution | str,
+) -> list[tuple[float, float, float]]:
+    """Relative differences of tared maximum, total and force at each level, printed with both values."""
+    ours = fem.press(
+        geometry.probe,
+        geometry.slab,
+        geometry.inclusion,
+        levels,
+        mechanics=mechanics,
+        quality=quality,
+        tilt=geometry.pose.tilt_deg,
+        position=geometry.pose.position_mm,
+        estimate=False,
+    )
+    theirs = ccx_runner.press(folder, geometry, levels, mechanics, res)
+    found = []
+    for level, we, they in zip(levels, ours, theirs, strict=True):
+        top = 1e3 * ccx_runner.tared(we.surface, True)["max_mm"]
+        total = ccx_runner.tared(we.surface, False)["total_mm3"]
+        pairs = (("max um", top, they.max_um), ("total mm3", total, they.total_mm3))
+        pairs = (*pairs, ("force N", we.force_N, they.force_N))
+        for name, a, b in pairs:
+            print(
+                f"{mechanics} {geometry.inclusion} {level:g} mm {name}: {a:.4f} / {b:.4f} / {a / b - 1:+.2%}"
+            )
+        print(f"   CalculiX: {they.seconds:.0f} s, scatter {they.scatter:.2%}; ours: {we.seconds:.0f} s")
+        found.append(tuple(a / b - 1 for _, a, b in pairs))
+    return found  # type: ignore[return-value]
+
+
+@needs_ccx
+def test_linear_at_a_glance(tmp_path: Path) -> None:
+    geometry = Geometry(PROBE, SLAB, INCLUSIONS[0])
+    ((top, total, force),) = compared(tmp_path, geometry, [1.0], "linear", "standard", FINE_EDGE)
+    assert abs(top) < 5e-3 and abs(total) < 5e-3 and abs(force) < 5e-3
+
+
+@needs_ccx
+@pytest.mark.slow
+@pytest.mark.parametrize("inclusion", INCLUSIONS, ids=str)
+def test_linear(tmp_path: Path, inclusion: fem.Inclusion) -> None:
+    geometry = Geometry(PROBE, SLAB, inclusion)
+    ((top, total, force),) = compared(tmp_path, geometry, [1.0], "linear", "standard", FINE_EDGE)
+    assert abs(top) < 5e-3 and abs(total) < 5e-3 and abs(force) < 5e-3
+
+
+@needs_ccx
+@pytest.mark.slow
+@pytest.mark.timeout(3000)
+@pytest.mark.parametrize(
+    "level",
+    [
+        1.0,
+        3.0,
+        pytest.param(
+            6.0,
+            marks=pytest.mark.xfail(
+                raises=fem.NotConverged, strict=True, reason="the probe's soft corners fold before 6 mm"
+            ),
+        ),
+    ],
+)
+@pytest.mark.parametrize("inclusion", INCLUSIONS, ids=str)
+def test_finite(tmp_path: Path, inclusion: fem.Inclusion, level: float) -> None:
+    """Totals are printed, not held: from 3 mm on they contain CalculiX's folded corners."""
+    geometry = Geometry(PROBE, SLAB, inclusion)
+    ((top, _, force),) = compared(tmp_path, geometry, [level], "finite", "standard", COARSE_EDGE)
+    assert abs(top) < 0.02 and abs(force) < 0.02
+
+
+@needs_ccx
+@pytest.mark.slow
+@pytest.mark.timeout(3000)
+@pytest.mark.parametrize(
+    "probe, tilt",
+    [(fem.Probe(25, PROBE.layers, dome_radius_mm=150), (0.0, 0.0)), (PROBE, (0.0, 2.0))],
+    ids=["dome", "tilt"],
+)
+def test_finite_where_contact_spreads(tmp_path: Path, probe: fem.Probe, tilt: tuple[float, float]) -> None:
+    geometry = Geometry(probe, SLAB, INCLUSIONS[0], Pose(tilt))
+    for differences in compared(tmp_path, geometry, [1.0, 2.0], "finite", "standard", COARSE_EDGE):
+        assert max(map(abs, differences)) < 0.03
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        ({"levels": [2.0, 1.0]}, "rising"),
+        ({"levels": []}, "rising"),
+        ({"quality": "fine"}, "quality: received 'fine'"),
+        ({"mechanics": "plastic"}, "mechanics: received 'plastic'"),
+        ({"mechanics": "linear", "tilt": (1.0, 0.0)}, "a tilt or a dome"),
+        ({"position": (17.5, 0.0)}, "position"),
+    ],
+)
+def test_bad_input(tmp_path: Path, change: dict[str, object], words: str) -> None:
+    given: dict[str, object] = {"levels": [1.0], "quality": "preview"} | change
+    levels = given.pop("levels")
+    with pytest.raises(ValueError, match=words) as caught:
+        fem.deck(tmp_path / "a.inp", PROBE, SLAB, INCLUSIONS[0], levels, **given)  # type: ignore[arg-type]
+    assert "\n" not in str(caught.value) and not (tmp_path / "a.inp").exists()
+
+
+def test_decks_differ_in_the_inclusion_alone(tmp_path: Path) -> None:
+    """The one to tare with has the same mesh, the tissue's modulus in the inclusion, and every step twice."""
+    texts = [
+        fem.deck(
+            tmp_path / "a.inp", PROBE, SLAB, INCLUSIONS[0], [1, 2], quality="preview", without_inclusion=bare
+        ).read_text()
+        for bare in (False, True)
+    ]
+    lines = [text.splitlines() for text in texts]
+    differ = [i for i, (a, b) in enumerate(zip(*lines, strict=True)) if a != b]
+    assert [lines[0][i - 2] for i in differ] == ["*MATERIAL, NAME=INCLUSION"]
+    assert texts[0].count("*STEP") == 2 * (1 + ccx.SETTLE)
+
+
+def test_chest_wall_moves_along_the_tilted_axis(tmp_path: Path) -> None:
+    """In the probe's frame; before the first step nothing overlaps, and a level counts from first contact of
+    the middle."""
+    tilted = Geometry(PROBE, SLAB, None, Pose((0.0, 2.0)))
+    found = ccx.bodies(tilted, COARSE_EDGE)
+    np.testing.assert_allclose(np.abs(found.normal), [np.sin(np.radians(2)), 0, np.cos(np.radians(2))])
+    assert found.start == pytest.approx(-12.5 * np.tan(np.radians(2)), abs=0.02)
+    assert (found.place[found.skin] @ found.normal).min() > (
+        found.place[found.tip] @ found.normal
+    ).max() - 1e-2
+    text = ccx.write(tmp_path / "a.inp", found, [1.0]).read_text()
+    moved = [float(line.split(",")[3]) for line in text.splitlines() if line.startswith("CHEST, ")][:3]
+    np.testing.assert_allclose(moved, (found.start - 1) * found.normal)
