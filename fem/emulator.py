@@ -23,6 +23,7 @@ from fem.model import Inclusion, NotModelled, Probe, Slab
 from fem.regression import Regression
 from fem.sampling import CLEARANCE, Plan, clearance, contrast, lines, quadratic
 from fem.solving import knots
+from fem.topology import Resolution
 
 Floats = NDArray[np.float64]
 
@@ -64,10 +65,12 @@ class Errors:
     own maximum.
 
     `pressure` and `displacement` are of the tared fields on the whole contact surface: largest, and root
-    mean square over the area; (n, 2). `size_mm` (n,) is the inclusion's. `finer` (p, 2): the same of what a
-    finer mesh adds to the tared pressure. `curve` (rows, 6): number of samples, core seconds they took, and
-    of a common set of held-out samples with `size_mm` >= 4 the median and the 95th percentile of the
-    pressure's largest error, and of its root mean square.
+    mean square over the area, the worst of all levels and moduli solved; (n, 2). `size_mm` (n,) is the
+    inclusion's. `finer` (p, 2): the same of what a finer mesh adds to the tared pressure. `curve` (rows, 7):
+    number of samples at small and at finite strain, core seconds they took, and of a common set of held-out
+    samples with `size_mm` >= 4 the median and the 95th percentile of the pressure's largest error, and of
+    its root mean square. `solves` (3, 2): of samples, of pairs of a fine and a lean mesh, and of samples at
+    finite strain, how many were tried, and how many of them failed and are missing from all this.
     """
 
     size_mm: Floats
@@ -75,6 +78,12 @@ class Errors:
     displacement: Floats
     finer: Floats
     curve: Floats
+    solves: Floats
+
+    @property
+    def failed_percent(self) -> float:
+        """Share of the solves that failed, the worst kind's."""
+        return float(100 * (self.solves[:, 1] / np.maximum(self.solves[:, 0], 1)).max())
 
     def percentile(self, name: str, percent: float, size_mm: float = 4.0, kind: int = 0) -> float:
         """Of errors `name` ("pressure" or "displacement") of inclusions with their `size_mm` on this one's
@@ -94,25 +103,28 @@ class Emulator:
         What was learned, and from which solves.
     x
         Lines of the answers' grid along x and y, (m,) mm.
-    unit, pressure, moved
+    pressure, moved
         Background at the knots (i, j) of thickness and tissue, as `sampling.background` gives it; (i, j,
         ...).
     rise, tared
         What the inclusion adds, as `sampling.solve` gives it, over `amplitudes`.
     finer
         What a finer mesh adds to the rise, as `sampling.refine` gives it, over `amplitudes`.
+    rise_more, tared_more
+        What finite strain adds, as `sampling.stretch` gives it, over `amplitudes`; None for a linear one.
     errors
         From cross-validation.
     """
 
     plan: Plan
     x: Floats
-    unit: Floats
     pressure: Floats
     moved: Floats
     rise: Regression
     tared: Regression
     finer: Regression
+    rise_more: Regression | None
+    tared_more: Regression | None
     errors: Errors
 
     def __call__(
@@ -198,10 +210,7 @@ def check(
     """Refuse what an emulator was not built for (NotModelled), and what lies outside its ranges
     (ValueError)."""
     own = plan.slab(slab.thickness_mm, slab.modulus_kPa)
-    same: list[tuple[str, object, object]] = [
-        ("probe", probe, plan.probe),
-        ("mechanics", mechanics, plan.mechanics),
-    ]
+    same = [*_parts(probe, plan.probe), ("mechanics", mechanics, plan.mechanics)]
     same += [(f"slab.{k}", getattr(slab, k), getattr(own, k)) for k in ("width_mm", "poisson", "sides")]
     same += [("tilt", tuple(tilt), (0.0, 0.0)), ("position", tuple(position), (0.0, 0.0))]
     if inclusion is not None:
@@ -231,6 +240,18 @@ def check(
         )
 
 
+def _parts(probe: Probe, own: Probe) -> list[tuple[str, object, object]]:
+    """Name, value and known value of each property of a probe."""
+    names = ("width_mm", "dome_radius_mm")
+    found: list[tuple[str, object, object]] = [
+        (f"probe.{k}", getattr(probe, k), getattr(own, k)) for k in names
+    ]
+    found.append(("probe.layers", len(probe.layers), len(own.layers)))
+    for number, pair in enumerate(zip(probe.layers, own.layers, strict=False)):
+        found += [(f"probe.layers.{number}.{k}", *(getattr(la, k) for la in pair)) for k in vars(pair[0])]
+    return found
+
+
 def _within(name: str, value: float, allowed: tuple[float, float], unit: str) -> None:
     low, high = allowed
     slack = 1e-9 * max(abs(low), abs(high))
@@ -244,22 +265,25 @@ def fields(emulator: Emulator, slab: Slab, inclusion: Inclusion | None, depth: f
     """The fields of `Emulated.surface` on the grid, (m, m) and (m, m, 3), at an indentation in mm."""
     plan, tissue = emulator.plan, slab.modulus_kPa
     at, level = knots(plan), lagrange(plan.levels, depth)
-    thick, soft = lagrange(at[0], 1 / slab.thickness_mm), lagrange(at[1], float(np.log(tissue)))
+    weights = np.multiply.outer(
+        lagrange(at[0], 1 / slab.thickness_mm), lagrange(at[1], float(np.log(tissue)))
+    )
 
-    def background(values: Floats) -> Floats:
-        return np.asarray(np.tensordot(soft, np.tensordot(thick, values, 1), 1))
+    def background(values: Floats, level: Floats) -> Floats:
+        return np.asarray(np.tensordot(np.multiply.outer(weights, level), values, 3))
 
-    pressure_0 = depth * tissue * np.tensordot(level, background(emulator.pressure), 1)
-    displacement_0 = depth * np.tensordot(level, background(emulator.moved), 1)
+    pressure_0 = depth * tissue * background(emulator.pressure, level)
+    displacement_0 = depth * background(emulator.moved, level)
     pressure, displacement = pressure_0, displacement_0
     if inclusion is not None:
         rise, tared = signal(emulator, slab, inclusion, level)
-        pressure = pressure_0 + rise * depth * tissue * background(emulator.unit)
+        unit = np.tensordot(weights, emulator.pressure[:, :, 0], 2)
+        pressure = pressure_0 + rise * depth * tissue * unit
         displacement = displacement_0 + depth * tared
     found = {}
     for suffix, p, u in (("", pressure, displacement), ("_0", pressure_0, displacement_0)):
         found["displacement" + suffix], found["pressure" + suffix] = u, np.maximum(p, 0.0)
-        found["area" + suffix] = _area(emulator.x, u, plan.mechanics == "finite")
+        found["area" + suffix] = _area(emulator.x, u, plan.finite)
     return found
 
 
@@ -268,20 +292,42 @@ def signal(emulator: Emulator, slab: Slab, inclusion: Inclusion, level: Floats) 
     plan = emulator.plan
     x, y = inclusion.offset
     big, small = max(abs(x), abs(y)), min(abs(x), abs(y))
-    folded = replace(inclusion, offset=(big, small))
-    point = np.array([inclusion.size, inclusion.depth, big, small, slab.thickness_mm, slab.modulus_kPa])
     s = float(contrast(np.array(inclusion.modulus / slab.modulus_kPa)))
-    along = lagrange(contrast(plan.ratios), s)
-    onto = resample(plan, Geometry(plan.probe, slab, folded), emulator.x)
-    inputs, n = features(plan, point[None]), onto[0].shape[1]
-    weights, scales = np.outer(level, along).ravel(), amplitudes(point, s)
-    rise = weights @ emulator.rise(inputs).reshape(len(weights), -1)
-    rise += along @ emulator.finer(inputs[:, CENTRED]).reshape(len(along), -1)
-    moved = weights @ emulator.tared(inputs).reshape(len(weights), -1)
-    rise = scales[0] * (onto[0] @ rise.reshape(n, n) @ onto[1].T)
-    parts = scales[1] * moved.reshape(n, n, 3).transpose(2, 0, 1)
-    tared = np.stack([onto[0] @ part @ onto[1].T for part in parts], axis=-1)
+    point = np.array([inclusion.size, inclusion.depth, big, small, slab.thickness_mm, slab.modulus_kPa, s])
+    geometry = Geometry(plan.probe, slab, replace(inclusion, offset=(big, small)))
+    along, inputs = lagrange(contrast(plan.ratios), s), features(plan, point[None])
+    linear = inputs[:, :-1]
+    rise = along @ (
+        emulator.rise(linear).reshape(len(along), -1)
+        + emulator.finer(linear[:, CENTRED]).reshape(len(along), -1)
+    )
+    parts = [
+        _on_grid(
+            geometry,
+            plan.resolution,
+            emulator.x,
+            rise,
+            along @ emulator.tared(linear).reshape(len(along), -1),
+        )
+    ]
+    if emulator.rise_more is not None and emulator.tared_more is not None:
+        more = (r(inputs).reshape(len(level) - 1, -1) for r in (emulator.rise_more, emulator.tared_more))
+        parts.append(_on_grid(geometry, plan.coarse, emulator.x, *(level[1:] @ m for m in more)))
+    scales = amplitudes(point, s)
+    rise, tared = (scale * sum(part) for scale, part in zip(scales, zip(*parts, strict=True), strict=True))
     return unfold(rise, tared, (x, y))
+
+
+def _on_grid(
+    geometry: Geometry, res: Resolution, x: Floats, rise: Floats, tared: Floats
+) -> tuple[Floats, Floats]:
+    """Carry fields from a mesh's nodes, flat, to the grid, (m, m) and (m, m, 3)."""
+    onto = resample(geometry, res, x)
+    n = onto[0].shape[1]
+    each = tared.reshape(n, n, 3).transpose(2, 0, 1)
+    return onto[0] @ rise.reshape(n, n) @ onto[1].T, np.stack(
+        [onto[0] @ u @ onto[1].T for u in each], axis=-1
+    )
 
 
 def unfold(rise: Floats, tared: Floats, offset: tuple[float, float]) -> tuple[Floats, Floats]:
@@ -307,10 +353,11 @@ def amplitudes(points: Floats, s: Floats | float) -> tuple[Floats, Floats]:
 
 
 def features(plan: Plan, points: Floats) -> Floats:
-    """Inputs of the regressions (n, 7), each about -1 to 1: size, depth of the centre, offsets, thickness,
-    tissue and nearness of the chest wall; points (n, 6) as of `Plan.points`."""
+    """Inputs of the regressions (n, 8), each about -1 to 1: size, depth of the centre, offsets, thickness,
+    tissue, nearness of the chest wall, and s, which only what finite strain adds depends on; points (n, 7) as
+    of `Plan.points`."""
     r = plan.ranges
-    size, depth, x, y, thickness, tissue = points.T
+    size, depth, x, y, thickness, tissue, s = points.T
     middle = (r.depth_mm[0] + r.size_mm[0] / 2, r.depth_mm[1] + r.size_mm[1] / 2)
 
     def even(values: Floats, ends: tuple[float, float]) -> Floats:
@@ -321,12 +368,13 @@ def features(plan: Plan, points: Floats) -> Floats:
     columns += [2 * offset / max(r.offset_mm, 1e-9) - 1 for offset in (x, y)]
     columns += [even(thickness, r.thickness_mm), even(tissue, r.tissue_kPa)]
     columns.append(1.5 * np.log(2 * CLEARANCE / (thickness - size - depth)))
+    columns.append((2 * s - sum(plan.signals)) / (plan.signals[1] - plan.signals[0]))
     return np.stack(columns, axis=1)
 
 
-def resample(plan: Plan, geometry: Geometry, x: Floats) -> tuple[Floats, Floats]:
-    """Matrices (m, n) that carry a field from a sample's nodes to the grid, along x and along y."""
-    along = lines(plan, geometry, plan.grid())
+def resample(geometry: Geometry, res: Resolution, x: Floats) -> tuple[Floats, Floats]:
+    """Matrices (m, n) that carry a field from a mesh's nodes to the grid, along x and along y."""
+    along = lines(geometry, res)
     return quadratic(along[0], x), quadratic(along[1], x)
 
 

@@ -15,15 +15,16 @@ from numpy.typing import NDArray
 
 from fem.emulator import Emulator, Errors
 from fem.regression import Regression
-from fem.sampling import PLAN, Plan
+from fem.sampling import PLAN, Plan, logical_lines
 from fem.solving import KNOTS
 
 Floats = NDArray[np.float64]
 
-_FORMAT = 1
+_FORMAT = 2
 _LARGEST = 512 * 2**20  # bytes of all arrays
 _REGRESSIONS = ("rise", "tared", "finer")
-_GRIDS = ("x", "unit", "pressure", "moved")
+_MORE = ("rise_more", "tared_more")  # that finite strain has besides
+_GRIDS = ("x", "pressure", "moved")
 
 
 class NotAnEmulator(ValueError):
@@ -33,7 +34,7 @@ class NotAnEmulator(ValueError):
 def save_emulator(emulator: Emulator, place: str | Path) -> None:
     """Write an emulator; the file appears whole or not at all."""
     arrays: dict[str, NDArray[Any]] = {name: getattr(emulator, name) for name in _GRIDS}
-    for name in _REGRESSIONS:
+    for name in _parts(emulator.plan):
         arrays |= {f"{name}.{f.name}": getattr(getattr(emulator, name), f.name) for f in fields(Regression)}
     arrays |= {f"errors.{f.name}": getattr(emulator.errors, f.name) for f in fields(Errors)}
     kept = {name: np.asarray(values, np.float64) for name, values in arrays.items()}
@@ -76,13 +77,18 @@ def load_emulator(place: str | Path) -> Emulator:
         ) from None
 
 
+def _parts(plan: Plan) -> tuple[str, ...]:
+    return (*_REGRESSIONS, *_MORE) if plan.finite else _REGRESSIONS
+
+
 def _read(data: bytes) -> dict[str, NDArray[Any]]:
     """The arrays of an npz, which may hold nothing but the expected ones, of plain numbers."""
     expected = {"head", *_GRIDS, *(f"errors.{f.name}" for f in fields(Errors))}
     expected |= {f"{name}.{f.name}" for name in _REGRESSIONS for f in fields(Regression)}
+    more = {f"{name}.{f.name}" for name in _MORE for f in fields(Regression)}
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         found = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-        if set(found) != expected or len(archive.infolist()) != len(expected):
+        if set(found) not in (expected, expected | more) or len(archive.infolist()) != len(found):
             raise ValueError("its arrays are not those of an emulator")
         if sum(info.file_size for info in found.values()) > _LARGEST:
             raise ValueError("it is too large")
@@ -102,24 +108,27 @@ def _checked(arrays: dict[str, NDArray[Any]]) -> Emulator:
     if number != b"%d" % _FORMAT:
         raise ValueError(f"format {number[:20]!r}, known is {_FORMAT}")
     plan = PLAN.validate_json(text)
-    m, n, levels, moduli = len(arrays["x"]), len(plan.grid()), len(plan.levels), len(plan.ratios)
+    if ("rise_more.inputs" in arrays) != plan.finite:
+        raise ValueError("its arrays are not those of its mechanics")
+    m, levels, moduli = len(arrays["x"]), len(plan.levels), len(plan.ratios)
+    lean, coarse = (len(logical_lines(res)) ** 2 for res in (plan.resolution, plan.coarse))
     half = plan.probe.width_mm / 2
     x = arrays["x"]
     if m < 3 or m % 2 == 0 or not (np.diff(x) > 0).all() or not np.allclose(x[[0, -1]], [-half, half]):
         raise ValueError("x does not span the probe")
-    shapes = {"x": (m,), "unit": (*KNOTS, m, m), "pressure": (*KNOTS, levels, m, m)}
+    shapes: dict[str, tuple[int, ...]] = {"x": (m,), "pressure": (*KNOTS, levels, m, m)}
     shapes["moved"] = (*KNOTS, levels, m, m, 3)
-    for name in _REGRESSIONS:
-        q = 5 if name == "finer" else 7
-        values = (1 if name == "finer" else levels) * moduli * n * n * (3 if name.endswith("tared") else 1)
-        shapes |= _shapes_of(arrays, name, q, values)
+    for name in _parts(plan):
+        q = 5 if name == "finer" else 8 if name in _MORE else 7
+        values = (levels - 1) * coarse if name in _MORE else moduli * lean
+        shapes |= _shapes_of(arrays, name, q, values * (3 if name.startswith("tared") else 1))
     points, pairs, rows = (len(arrays[f"errors.{k}"]) for k in ("size_mm", "finer", "curve"))
     shapes |= {
         "errors.size_mm": (points,),
         "errors.pressure": (points, 2),
         "errors.displacement": (points, 2),
     }
-    shapes |= {"errors.finer": (pairs, 2), "errors.curve": (rows, 6)}
+    shapes |= {"errors.finer": (pairs, 2), "errors.curve": (rows, 7), "errors.solves": (3, 2)}
     for name, shape in shapes.items():
         if arrays[name].shape != shape:
             raise ValueError(f"{name} has shape {arrays[name].shape}, not {shape}")
@@ -143,9 +152,10 @@ def _shapes_of(arrays: dict[str, NDArray[Any]], name: str, q: int, values: int) 
 
 def _assemble(plan: Plan, arrays: dict[str, NDArray[Any]]) -> Emulator:
     grids = {name: arrays[name] for name in _GRIDS}
-    parts = {
+    parts: dict[str, Regression | None] = dict.fromkeys(_MORE)
+    parts |= {
         name: Regression(**{f.name: arrays[f"{name}.{f.name}"] for f in fields(Regression)})
-        for name in _REGRESSIONS
+        for name in _parts(plan)
     }
     errors = Errors(**{f.name: arrays[f"errors.{f.name}"] for f in fields(Errors)})
     return Emulator(plan=plan, errors=errors, **grids, **parts)  # type: ignore[arg-type]

@@ -2,8 +2,12 @@
 
 Everything scales with the tissue's modulus, so the inclusion's enters as the contrast c with it. A sphere's
 signal goes as s = (c - 1) / (c + 1.5) (Eshelby 1957; [eshelby1957]); what is left of c after that is a
-polynomial in s through few nodes, and all of them share one factor. So do the press levels, which are one
-solve at small strain.
+polynomial in s through few nodes, and all of them share one factor at small strain.
+
+Finite strain costs many times more, and adds some per cent to the signal that hardly depend on the mesh: it
+is learned apart, as the difference that it makes on a coarse mesh, from fewer specimens with one modulus
+each. All press levels lie on one way down; between them and small strain, which is level 0, the answers per
+mm are a polynomial in the indentation.
 
 Contact pressures are kept as their *rise* over the tissue without inclusion, on the same mesh: next to the
 probe's edge both follow the same singularity, and so does their discretisation error. In the rise both
@@ -28,7 +32,7 @@ from fem.equilibrium import State
 from fem.mesh import Geometry
 from fem.meshed import build
 from fem.model import Inclusion, Length, Poisson, Probe, Slab, check
-from fem.path import path
+from fem.path import Path, path
 from fem.pressing import _contact
 from fem.solver import one_thread
 from fem.topology import Resolution
@@ -37,12 +41,18 @@ Floats = NDArray[np.float64]
 
 _CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False)
 _BEYOND = 0.03  # by how much of a range the samples reach beyond it: at the ends, regression is worst
+_OFFSETS = (1, 1), (0, 0), (1, 0), (0, 0)  # which of its offsets each point of four keeps
 CLEARANCE = 4.0
 """Least distance between inclusion and chest wall, mm."""
 
 LEAN = Resolution(arc=3, core=1, shell=3, above=3, below=1, edge=2, side=3, layer=1, backing=1)
 """Mesh of the samples. Its rise differs from 115 thousand unknowns in a quarter by what
 `tests/bench/test_emulator.py` measures."""
+
+COARSE = Resolution(
+    arc=2, core=1, shell=2, above=2, below=1, edge=2, side=2, layer=1, backing=1, growth=(2.0, 1.6)
+)
+"""Mesh of what finite strain adds."""
 
 FINE = mesh.QUALITIES["standard"]
 """Mesh of the background and of what makes up for the lean one; its surface is that of the answers."""
@@ -96,6 +106,7 @@ class Plan:
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
     resolution: Resolution = LEAN
     fine: Resolution = FINE
+    coarse: Resolution = COARSE
 
     def __post_init__(self) -> None:
         if self.probe.dome_radius_mm is not None:
@@ -104,7 +115,7 @@ class Plan:
                 "allowed is none: the emulator learns flat probes only"
             )
 
-        for name, res in (("resolution", self.resolution), ("fine", self.fine)):
+        for name, res in (("resolution", self.resolution), ("fine", self.fine), ("coarse", self.coarse)):
             cells = [number for part, number in vars(res).items() if part != "growth"]
             if not all(1 <= number <= 32 for number in cells):
                 raise ValueError(f"{name}: received {res}; allowed are 1 to 32 cells along each part")
@@ -115,52 +126,61 @@ class Plan:
         return Slab(thickness, self.width_mm, modulus, self.poisson, self.sides)
 
     @property
+    def finite(self) -> bool:
+        return self.mechanics == "finite"
+
+    @property
     def levels(self) -> Floats:
-        """Indentations between which the answers are a polynomial, mm; small strain needs one."""
-        low, high = self.ranges.indentation_mm
-        return (
-            np.array([1.0]) if self.mechanics == "linear" else np.array([low, 0.3 * high, 0.65 * high, high])
-        )
+        """Indentations between which the answers per mm are a polynomial, mm; 0 is small strain, which needs
+        no other."""
+        return self.ranges.indentation_mm[1] * np.arange(4.0) / 3 if self.finite else np.zeros(1)
 
     @property
     def ratios(self) -> Floats:
         """Moduli of the inclusion over the tissue's, evenly spaced in s."""
-        soft, stiff = self.ranges.tissue_kPa
-        low, high = contrast(
-            np.array([self.ranges.modulus_kPa[0] / stiff, self.ranges.modulus_kPa[1] / soft])
-        )
-        s = np.linspace(low, high, 3)
+        s = np.linspace(*self.signals, 3)
         return np.asarray((1 + 1.5 * s) / (1 - s))
 
+    @property
+    def signals(self) -> tuple[float, float]:
+        """Lowest and highest s of the ranges."""
+        soft, stiff = self.ranges.tissue_kPa
+        return (
+            float(contrast(np.array(self.ranges.modulus_kPa[0] / stiff))),
+            float(contrast(np.array(self.ranges.modulus_kPa[1] / soft))),
+        )
+
     def points(self) -> Iterator[Floats]:
-        """Scrambled Sobol sequence of (size, depth, offsets x >= y >= 0, thickness, tissue), those that
-        fit."""
+        """Scrambled Sobol sequence of (size, depth, offsets x >= y >= 0, thickness, tissue, s), those that
+        fit; s is that of the inclusion where one modulus is solved. Of four points one keeps its offsets, one
+        keeps x, and two lie under the probe's middle: symmetry makes these two and five times cheaper."""
         r = self.ranges
         low, high = (
             np.array(side) for side in zip(r.size_mm, r.depth_mm, r.thickness_mm, r.tissue_kPa, strict=True)
         )
         beyond = _BEYOND * (high - low)
-        sobol = qmc.Sobol(6, scramble=True, rng=np.random.default_rng(self.seed))
+        sobol = qmc.Sobol(7, scramble=True, rng=np.random.default_rng(self.seed))
+        number = 0
         while True:
             for u in sobol.random(64):
                 size, depth, thickness, tissue = low - beyond + u[:4] * (high - low + 2 * beyond)
-                y, x = np.sort(u[4:]) * r.offset_mm * (1 + _BEYOND)
+                x, y = np.sort(u[4:6])[::-1] * r.offset_mm * (1 + _BEYOND)
+                s = self.signals[0] + u[6] * (self.signals[1] - self.signals[0])
                 if clearance(size, depth, thickness) >= 0:
-                    yield np.array([size, depth, x, y, thickness, tissue])
+                    keep_x, keep_y = _OFFSETS[number % len(_OFFSETS)]
+                    yield np.array([size, depth, keep_x * x, keep_y * y, thickness, tissue, s])
+                    number += 1
 
     def inside(self, points: Floats) -> NDArray[np.bool_]:
-        """Which of the points (n, 6) lie within the ranges, (n,)."""
+        """Which of the points (n, 7) lie within the ranges, (n,)."""
         r = self.ranges
         pairs = (r.size_mm, r.depth_mm, (0.0, r.offset_mm), (0.0, r.offset_mm), r.thickness_mm, r.tissue_kPa)
         low, high = np.array(pairs).T
-        return np.asarray(((points >= low) & (points <= high)).all(axis=1))
+        specimen = points[:, :6]
+        return np.asarray(((specimen >= low) & (specimen <= high)).all(axis=1))
 
     def point(self, number: int) -> Floats:
         return next(islice(self.points(), number, None))
-
-    def grid(self) -> Floats:
-        """Logical lines of the samples' nodes on the footprint, (n,)."""
-        return logical_lines(self.resolution)
 
 
 PLAN: TypeAdapter[Plan] = TypeAdapter(Plan)
@@ -178,15 +198,15 @@ def logical_lines(res: Resolution) -> Floats:
     return np.concatenate([-half[:0:-1], half])
 
 
-def lines(plan: Plan, geometry: Geometry, logical: Floats) -> tuple[Floats, Floats]:
-    """Real coordinates of the samples' nodes along x and y, mm, each (n,)."""
-    spans = mesh.box_around(geometry).surface
-    return spans[0].lines(logical, plan.resolution), spans[1].lines(logical, plan.resolution)
+def lines(geometry: Geometry, res: Resolution) -> tuple[Floats, Floats]:
+    """Real coordinates of a mesh's nodes on the footprint along x and y, mm, each (n,)."""
+    spans, logical = mesh.box_around(geometry).surface, logical_lines(res)
+    return spans[0].lines(logical, res), spans[1].lines(logical, res)
 
 
 def geometry_at(plan: Plan, point: Floats, modulus: float) -> Geometry:
     """Geometry of a point of the plan, with an inclusion of a modulus, kPa."""
-    size, depth, x, y, thickness, tissue = (float(v) for v in point)
+    size, depth, x, y, thickness, tissue = (float(v) for v in point[:6])
     slab = plan.slab(thickness, tissue)
     inclusion = Inclusion(size, depth, modulus, (x, y), plan.inner_poisson)
     check(plan.probe, slab, inclusion)
@@ -194,58 +214,74 @@ def geometry_at(plan: Plan, point: Floats, modulus: float) -> Geometry:
 
 
 def solve(plan: Plan, point: Floats) -> dict[str, Floats]:
-    """Solve one point for all levels and moduli.
+    """Solve one point for all moduli at small strain.
 
     Returns
     -------
-    `rise` (levels, moduli, n, n): pressure over the same without inclusion, in units of the pressure of the
-    tied, small-strain press without inclusion; `moved` (levels, moduli, n, n, 3): tared displacement per mm
-    of indentation.
+    `rise` (moduli, n, n): pressure over the same without inclusion, in units of the latter; `moved` (moduli,
+    n, n, 3): tared displacement per mm of indentation.
     """
     geometries = [geometry_at(plan, point, float(r * point[5])) for r in plan.ratios]
-    first, finite = geometries[0], plan.mechanics == "finite"
     with one_thread():
-        model = build(first, plan.resolution, finite)
-        bare = path(first, model, False)
-        level = float(plan.levels[0])
-        unit = None
-        if finite:
-            state = path(first, build(first, plan.resolution, False), False).to(1.0)
-            unit = _fields(first, (state, state), plan.resolution)[0]
-        rise, moved = [], []
-        for geometry in geometries:
-            full = path(geometry, model, True, bare)
-            for level in plan.levels:
-                states = full.to(float(level)), bare.to(float(level))
-                pressure, displacement, pressure_0, displacement_0 = _fields(
-                    geometry, states, plan.resolution
-                )
-                scale = pressure_0 if unit is None else unit * level
-                rise.append((pressure - pressure_0) / scale)
-                moved.append((displacement - displacement_0) / level)
-    shape = len(geometries), len(plan.levels)
-    return {
-        "rise": np.stack(rise).reshape(*shape, *rise[0].shape).swapaxes(0, 1),
-        "moved": np.stack(moved).reshape(*shape, *moved[0].shape).swapaxes(0, 1),
-    }
+        model = build(geometries[0], plan.resolution, False)
+        bare = path(geometries[0], model, False)
+        found = [_tared(g, path(g, model, True, bare), bare, 1.0) for g in geometries]
+    return {name: np.stack([f[k] for f in found]) for k, name in enumerate(("rise", "moved"))}
 
 
 def refine(plan: Plan, point: Floats) -> dict[str, Floats]:
-    """What the finer mesh adds to the rise at small strain under the probe's middle, where symmetry makes it
-    cheap.
+    """What the finer mesh adds to the rise under the probe's middle, where symmetry makes it cheap.
 
     Returns
     -------
-    `rise` (1, moduli, n, n) as of `solve`, fine minus lean, at the lean mesh's nodes.
+    `rise` (moduli, n, n) as of `solve`, fine minus lean, at the lean mesh's nodes.
     """
     point = np.array([*point[:2], 0.0, 0.0, *point[4:]])
-    plans = [replace(plan, mechanics="linear", resolution=res) for res in (plan.resolution, plan.fine)]
-    lean, fine = (solve(p, point) for p in plans)
+    lean, fine = (solve(replace(plan, resolution=res), point) for res in (plan.resolution, plan.fine))
     geometry = geometry_at(plan, point, 1.0)
-    nodes = [lines(p, geometry, p.grid())[0] for p in plans]
+    nodes = [lines(geometry, res)[0] for res in (plan.resolution, plan.fine)]
     onto = quadratic(nodes[1], nodes[0])
-    rise = np.einsum("ai,lcij,bj->lcab", onto, fine["rise"], onto, optimize=True)
+    rise = np.einsum("ai,cij,bj->cab", onto, fine["rise"], onto, optimize=True)
     return {"rise": rise - lean["rise"]}
+
+
+def stretch(plan: Plan, point: Floats) -> dict[str, Floats]:
+    """What finite strain adds on the coarse mesh, for the point's own s.
+
+    Returns
+    -------
+    `rise` (levels, k, k) and `moved` (levels, k, k, 3) as of `solve`, finite minus small strain, for the
+    levels but 0; the rise is in units of the pressure without inclusion at small strain.
+
+    Raises
+    ------
+    NotConverged, NotModelled
+        If no equilibrium is found at one of the levels.
+    """
+    ratio = (1 + 1.5 * point[6]) / (1 - point[6])
+    geometry, res = geometry_at(plan, point, float(ratio * point[5])), plan.coarse
+    with one_thread():
+        model = build(geometry, res, False)
+        bare = path(geometry, model, False)
+        small = _tared(geometry, path(geometry, model, True, bare), bare, 1.0)
+        state = bare.to(1.0)
+        unit = _fields(geometry, (state, state))[0]
+        model = build(geometry, res, True)
+        bare = path(geometry, model, False)
+        full = path(geometry, model, True, bare)
+        found = [_tared(geometry, full, bare, float(level), unit) for level in plan.levels[1:]]
+    return {name: np.stack([f[k] - small[k] for f in found]) for k, name in enumerate(("rise", "moved"))}
+
+
+def _tared(
+    geometry: Geometry, full: Path, bare: Path, level: float, unit: Floats | None = None
+) -> tuple[Floats, Floats]:
+    """Rise (n, n) over `unit` kPa / mm, by default the bare pressure itself, and tared displacement (n, n,
+    3), both per mm of the level, mm."""
+    other = bare.to(level)
+    pressure, moved, pressure_0, moved_0 = _fields(geometry, (full.to(level), other))
+    scale = pressure_0 if unit is None else unit * level
+    return (pressure - pressure_0) / scale, (moved - moved_0) / level
 
 
 def background(plan: Plan, thickness: float, tissue: float) -> dict[str, Floats]:
@@ -253,40 +289,29 @@ def background(plan: Plan, thickness: float, tissue: float) -> dict[str, Floats]
 
     Returns
     -------
-    Lines `x` (m,); per kPa of the tissue and mm of indentation: `unit` (m, m), the pressure of the tied
-    press at small strain, and `pressure` (levels, m, m); `moved` (levels, m, m, 3), displacement per mm of
-    indentation.
+    Lines `x` (m,); `pressure` (levels, m, m) per kPa of the tissue and mm of indentation; `moved` (levels, m,
+    m, 3), displacement per mm of indentation.
     """
     res = plan.fine
     # an inclusion that is left out gives every thickness the same lines
     still = Inclusion(0.3 * plan.probe.width_mm, 0.2 * thickness, tissue)
     geometry = Geometry(plan.probe, plan.slab(thickness, tissue), still)
     with one_thread():
-        linear = path(geometry, build(geometry, res, False), False)
-        state = linear.to(1.0)
-        unit, moved, _, _ = _fields(geometry, (state, state), res)
-        contact, _ = _contact(geometry, (state, state))
-        x = np.unique(np.round(np.asarray(contact.points[:, 0], dtype=float), 9))
-        found: dict[str, list[Floats]] = {"pressure": [unit], "moved": [moved]}
-        if plan.mechanics == "finite":
+        state = path(geometry, build(geometry, res, False), False).to(1.0)
+        found = [_fields(geometry, (state, state))[:2]]
+        if plan.finite:
             bare = path(geometry, build(geometry, res, True), False)
-            found = {"pressure": [], "moved": []}
-            for level in plan.levels:
+            for level in plan.levels[1:]:
                 state = bare.to(float(level))
-                pressure, moved, _, _ = _fields(geometry, (state, state), res)
-                found["pressure"].append(pressure / level)
-                found["moved"].append(moved / level)
+                found.append(tuple(f / level for f in _fields(geometry, (state, state))[:2]))
     return {
-        "x": x,
-        "unit": unit / tissue,
-        "pressure": np.stack(found["pressure"]) / tissue,
-        "moved": np.stack(found["moved"]),
+        "x": lines(geometry, res)[0],
+        "pressure": np.stack([f[0] for f in found]) / tissue,
+        "moved": np.stack([f[1] for f in found]),
     }
 
 
-def _fields(
-    geometry: Geometry, states: tuple[State, State], res: Resolution
-) -> tuple[Floats, Floats, Floats, Floats]:
+def _fields(geometry: Geometry, states: tuple[State, State]) -> tuple[Floats, Floats, Floats, Floats]:
     """Pressure (n, n) and displacement (n, n, 3) on the whole footprint, of both states; kPa, mm."""
     contact, _ = _contact(geometry, states)
     n = round(contact.n_points**0.5)

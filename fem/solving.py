@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fem.model import NotConverged, NotModelled
-from fem.sampling import PLAN, Plan, background, refine, solve
+from fem.sampling import PLAN, Plan, background, refine, solve, stretch
 
 Floats = NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -28,8 +28,9 @@ class NotBuilt(ValueError):
 
 
 SHARE = 8  # samples for each pair of a fine and a lean mesh
+STRETCHED = 1  # samples for each one at finite strain, which is the same specimen as an earlier one
 _FIRST = 16  # pairs that come with one sample each
-KNOTS = (4, 4)  # Chebyshev nodes of the background along thickness and tissue
+KNOTS = (3, 3)  # Chebyshev nodes of the background along thickness and tissue: 0.1 % off between them
 
 
 def chebyshev(low: float, high: float, nodes: int) -> Floats:
@@ -48,7 +49,7 @@ def knots(plan: Plan) -> tuple[Floats, Floats]:
 
 
 def file_of(folder: Path, kind: str, number: int) -> Path:
-    """Where a solve is kept: kind "background", "sample" or "pair"."""
+    """Where a solve is kept: kind "background", "sample", "pair" or "stretch"."""
     return folder / f"{kind}-{number:05d}.npz"
 
 
@@ -94,7 +95,6 @@ def run(
             for worker in multiprocessing.active_children():  # what they are at is left undone
                 worker.terminate()
             raise
-    progress("solved", 1.0)
 
 
 def claim(plan: Plan, folder: Path) -> None:
@@ -126,6 +126,8 @@ def _tasks(plan: Plan, folder: Path, samples: int | None) -> Iterator[tuple[str,
                 yield "pair", pairs
                 pairs += 1
             yield "sample", number
+            if plan.finite and number % STRETCHED == 0:
+                yield "stretch", number // STRETCHED
 
     for kind, number in order():
         if not file_of(folder, kind, number).exists():
@@ -145,6 +147,9 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
+_SOLVES = {"sample": solve, "pair": refine, "stretch": stretch}
+
+
 def _work(plan_json: bytes, folder: str, kind: str, number: int) -> None:
     plan = PLAN.validate_json(plan_json)
     start = time.process_time()
@@ -155,8 +160,8 @@ def _work(plan_json: bytes, folder: str, kind: str, number: int) -> None:
     else:
         point = plan.point(number)
         try:
-            found = (solve if kind == "sample" else refine)(plan, point)
-        except (NotConverged, NotModelled, ArithmeticError, ValueError, np.linalg.LinAlgError):
+            found = _SOLVES[kind](plan, point)
+        except (NotConverged, NotModelled, ArithmeticError, np.linalg.LinAlgError):
             found = {}  # kept as a gap, so that a build that goes on does not try it again
         found["point"] = point
     found["seconds"] = np.array(time.process_time() - start)
@@ -176,7 +181,23 @@ def _write(place: Path, text: bytes) -> None:
 
 def solved(folder: Path, kind: str, first: int | None = None) -> Iterator[dict[str, Floats]]:
     """The finished solves of a kind in their order, of the `first` ones; those that failed are left out."""
-    for place in sorted(folder.glob(f"{kind}-*.npz"))[:first]:
+    for place in _kept(folder, kind, first):
         with np.load(place, allow_pickle=False) as data:
             if len(data.files) > 2:
-                yield {name: data[name] for name in data.files}
+                yield {name: data[name] for name in data.files} | {"number": np.array(_number(place))}
+
+
+def tally(folder: Path, kind: str, first: int | None = None) -> tuple[int, int]:
+    """How many solves of a kind were tried, and how many of them failed."""
+    return len(_kept(folder, kind, first)), len(_kept(folder, kind, first)) - len(
+        list(solved(folder, kind, first))
+    )
+
+
+def _kept(folder: Path, kind: str, first: int | None) -> list[Path]:
+    found = sorted(folder.glob(f"{kind}-*.npz"))
+    return [place for place in found if first is None or _number(place) < first]
+
+
+def _number(place: Path) -> int:
+    return int(place.stem.rpartition("-")[2])

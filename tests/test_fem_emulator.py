@@ -87,15 +87,15 @@ def test_held_out_solves_are_met(emulator: Emulator) -> None:
     errors = []
     for number in range(5):
         point = other.point(number)
-        truth = solve(other, point)["rise"][0, 1]
+        truth = solve(other, point)["rise"][1]
         geometry = geometry_at(PLAN, point, float(PLAN.ratios[1] * point[5]))
         assert geometry.inclusion is not None
         coarse = replace(emulator, finer=silent(emulator.finer))
         guess, _ = signal(coarse, geometry.slab, geometry.inclusion, np.ones(1))
-        onto = resample(PLAN, geometry, emulator.x)
+        onto = resample(geometry, PLAN.resolution, emulator.x)
         unit = np.tensordot(
             lagrange(tissue, np.log(point[5])),
-            np.tensordot(lagrange(thick, 1 / point[4]), emulator.unit, 1),
+            np.tensordot(lagrange(thick, 1 / point[4]), emulator.pressure[:, :, 0], 1),
             1,
         )
         true = onto[0] @ truth @ onto[1].T * unit
@@ -268,7 +268,7 @@ def test_a_strangers_file_is_not_trusted(
     save_emulator(emulator, place)
     bomb = np.array([Bomb()], dtype=object)
     wrong = [("x", bomb), ("head", bomb), ("x", emulator.x[1:]), ("x", emulator.x[::-1].copy())]
-    wrong += [("unit", np.full_like(emulator.unit, np.nan)), ("rise.lengths", -emulator.rise.lengths)]
+    wrong += [("pressure", np.full_like(emulator.pressure, np.nan)), ("rise.lengths", -emulator.rise.lengths)]
     wrong += [("rise.modes", emulator.rise.modes[:, 1:]), ("tared.weights", emulator.tared.weights[:, 1:])]
     wrong += [("head", np.frombuffer(b"2\n{}", np.uint8)), ("head", np.frombuffer(b"1\n{}", np.uint8))]
     wrong += [("errors.curve", np.zeros((2, 5))), ("x", emulator.x.astype(np.float32))]

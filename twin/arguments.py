@@ -34,6 +34,7 @@ examples:
   twin simulate tsis --size 8 --depth 5 --modulus 120 --indentation 1 2 3 --seed 7 --out levels
   twin simulate tsis --size 10 --depth 5 --modulus 100 --offset 3 0 --tilt 0 2 --out tilted
   twin simulate my-sensor.toml --no-inclusion --force 0.5 --mechanics linear --out flat
+  twin simulate --size 9 --depth 6 --modulus 80 --mechanics emulator --emulator tsis.npz --out quick
 """
 
 _EXPORT = """\
@@ -53,7 +54,7 @@ around the design's, fit, and say how far held-out ones are off. What was solved
 the same command goes on with it, also after Ctrl-C.
 
 examples:
-  twin emulate tsis --mechanics linear --minutes 30 --out tsis.npz
+  twin emulate tsis --minutes 30 --out emulators/tsis.npz
   twin emulate my-sensor.toml --samples 400 --workers 2 --out mine.npz
 """
 
@@ -95,7 +96,10 @@ def _parser() -> Parser:
         "design", metavar="DESIGN", nargs="?", default="tsis", help="name or TOML file (default tsis)"
     )
     _add_inclusion_flags(simulate)
-    _add_pose_flags(simulate)
+    _add_pose_flags(simulate, "emulator")
+    simulate.add_argument(
+        "--emulator", metavar="FILE.npz", help="for --mechanics emulator (default emulators/DESIGN.npz)"
+    )
     press = simulate.add_mutually_exclusive_group()
     _add_depths(press)
     press.add_argument(
@@ -157,17 +161,15 @@ def _add_inclusion_flags(parser: Parser) -> None:
     parser.add_argument("--no-inclusion", action="store_true", help="homogeneous tissue")
 
 
-def _add_mechanics_flag(parser: Parser) -> None:
+def _add_mechanics_flag(parser: Parser, *more: str) -> None:
+    words = " or ".join(MECHANICS) + " strain" + "".join(f", or {word}" for word in more)
     parser.add_argument(
-        "--mechanics",
-        type=choice(*MECHANICS),
-        metavar="M",
-        help=" or ".join(MECHANICS) + " strain (default: the design's)",
+        "--mechanics", type=choice(*MECHANICS, *more), metavar="M", help=words + " (default: the design's)"
     )
 
 
-def _add_pose_flags(parser: Parser) -> None:
-    _add_mechanics_flag(parser)
+def _add_pose_flags(parser: Parser, *more: str) -> None:
+    _add_mechanics_flag(parser, *more)
     _add_pair(parser, "--tilt", "turn of the sensor about x, then y, degrees (default: the design's)")
     _add_pair(parser, "--position", "sensor's centre minus the specimen's, mm (default: the design's)")
 

@@ -45,6 +45,7 @@ _FLAGS = {
     "press.tilt_deg": "--tilt",
     "press.position_mm": "--position",
     "mechanics": "--mechanics",
+    "emulator": "--emulator",
     "vtu": "--vtu",
     "ccx": "--ccx",
     "out": "--out",
@@ -97,9 +98,15 @@ def _run(arguments: argparse.Namespace) -> int:
         design = load_design("tsis")
         _simulate(arguments, design, DEMO_INCLUSION, design.press.indentation_mm)
     elif arguments.verb == "simulate":
+        options = Options()
+        if arguments.mechanics == "emulator":
+            options = Options(mechanics="emulator", emulator=arguments.emulator)
+            arguments.mechanics = None
+        elif arguments.emulator is not None:
+            raise DesignError("--emulator", "it with other mechanics", "it with --mechanics emulator only")
         design, inclusion = _pressed(arguments), _inclusion(arguments)
         levels = arguments.force or arguments.indentation or design.press.indentation_mm
-        _simulate(arguments, design, inclusion, levels, by_force=bool(arguments.force))
+        _simulate(arguments, design, inclusion, levels, bool(arguments.force), options)
     elif arguments.verb == "export":
         _export(arguments, _pressed(arguments), _inclusion(arguments))
     elif arguments.verb == "emulate":
@@ -115,6 +122,7 @@ def _simulate(
     inclusion: fem.Inclusion | None,
     levels: Sequence[float],
     by_force: bool = False,
+    mechanics: Options | None = None,
 ) -> None:
     if arguments.out is None:
         raise DesignError("out", "nothing", "the folder to make for the results")
@@ -132,6 +140,7 @@ def _simulate(
             seed=arguments.seed,
             device=arguments.device,
             progress=tell,
+            **(mechanics or {}),
         )
         if by_force:
             frames = simulate(design, inclusion, force=levels, **options)
@@ -185,7 +194,7 @@ def _emulate(arguments: argparse.Namespace) -> None:
 
         def tell(stage: str, done: float) -> None:
             interrupt.stop_if_asked()
-            report(stage.rstrip(" 0123456789"), done)
+            report("solves" if stage[-1].isdigit() else stage, done)
 
         built = emulate(
             design,
