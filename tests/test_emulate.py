@@ -25,6 +25,12 @@ def test_the_papers_sensor_and_its_box() -> None:
         assert value == pytest.approx(getattr(expected, name)), name
 
 
+def test_at_finite_strain_presses_are_half_as_deep() -> None:
+    plan = emulate.plan_of(load_design("tsis"))
+    assert plan.mechanics == "finite" and plan.ranges.indentation_mm == (0.1, 3.0)
+    assert list(plan.levels) == [0.0, 1.0, 2.0, 3.0]
+
+
 def test_designs_that_are_not_straight_are_refused() -> None:
     design = load_design("tsis")
     for changed, field in (

@@ -18,7 +18,7 @@ from fem.sampling import Plan, contrast, geometry_at, solve, stretch
 from fem.solving import file_of, solved, tally
 
 FINITE = replace(PLAN, mechanics="finite", coarse=COARSE, fine=COARSE)
-SAMPLES = 48
+SAMPLES = 32
 
 
 def deepest(depth: float) -> Plan:
