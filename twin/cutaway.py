@@ -76,7 +76,7 @@ def draw_cut(axes: Axes, frame: Pictured, letter: str) -> None:
     if y:
         title = f"Cut through the inclusion (y = {y:g} mm), pressed {indentation:.2f} mm"
     if frame.cut is None:
-        title = f"Contact line at y = {y:g} mm, pressed {indentation:.2f} mm; dashed: not computed"
+        title = f"At y = {y:g} mm, pressed {indentation:.2f} mm; dashed: not computed"
     axes.set_title(f"{letter}  {title}")
 
 
@@ -106,7 +106,8 @@ def _outline(axes: Axes, frame: Pictured) -> tuple[Floats, Floats]:
     line = np.stack(
         [x + _along_x(frame, displacement[:, 0], x, y), _along_x(frame, displacement[:, 2], x, y)], 1
     )
-    tissue = np.array([[-side, -down], *line, [side, -down], [side, deep], [-side, deep]])
+    rims = [(line[0, 0], -down), (line[-1, 0], -down)]
+    tissue = np.array([(-side, -down), rims[0], *line, rims[1], (side, -down), (side, deep), (-side, deep)])
     axes.add_patch(Polygon(tissue, closed=True, facecolor=TISSUE, edgecolor="none"))
     top = [*line]
     depth = 0.0
@@ -119,8 +120,8 @@ def _outline(axes: Axes, frame: Pictured) -> tuple[Floats, Floats]:
             axes.plot(*low.T, color=INK, lw=0.6, ls=DASHED)
         top = [*low]
     axes.plot(*line.T, color=INK, lw=1.0)
-    for sign in (-1, 1):
-        axes.plot([sign * side, line[0 if sign < 0 else -1, 0]], [-down, -down], color=INK, lw=0.6, ls=DASHED)
+    for rim, end in zip(rims, (-side, side), strict=True):
+        axes.plot([end, rim[0]], [-down, -down], color=INK, lw=0.6, ls=DASHED)
     if found is not None:
         centre = (found.offset[0], found.centre_mm - down)
         style: dict[str, Any] = {"facecolor": "none", "edgecolor": INCLUSION, "lw": 1.0, "ls": DASHED}
