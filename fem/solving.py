@@ -70,12 +70,12 @@ def run(
     """
     start = time.monotonic()
     claim(plan, folder)
-    tasks = _tasks(plan, folder, samples)
+    listed = None if samples is None else list(_tasks(plan, folder, samples))
     context = multiprocessing.get_context("spawn")
     done, running = 0, set[Future[None]]()
     with ProcessPoolExecutor(workers, context, initializer=_alone) as pool:
         try:
-            for kind, number in tasks:
+            for kind, number in listed or _tasks(plan, folder, samples):
                 spent = time.monotonic() - start
                 if seconds is not None and spent > seconds and kind != "background":
                     break
@@ -86,7 +86,7 @@ def run(
                     for future in ready:
                         future.result()
                 by_time = 0.0 if seconds is None else spent / seconds
-                by_count = 0.0 if samples is None else number / samples if kind == "sample" else 0.0
+                by_count = 0.0 if listed is None else done / len(listed)
                 progress(f"{kind} {number + 1}", min(1.0, max(by_time, by_count)))
             for future in running:
                 future.result()

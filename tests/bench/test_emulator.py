@@ -38,9 +38,7 @@ def test_emulator_after_half_an_hour(tmp_path: Path) -> None:
     assert np.array_equal(again.rise.weights, built.rise.weights)
     for quality, count in UNSEEN.items():
         missed = np.array([missed_by(built, point, quality) for point in unseen(built, quality, count)])
-        print(
-            f"against presses of {quality} quality at 1, 2, 3 mm: largest error of the tared pressure, and rms, %:"
-        )
+        print(f"tared pressure against presses of {quality} quality, worst of 1, 2, 3 mm: largest, rms, %:")
         print(np.round(missed, 2).tolist())
         assert missed[:, 1].max() <= MEDIAN_PERCENT
     errors = built.errors
