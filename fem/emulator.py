@@ -18,10 +18,11 @@ from scipy.optimize import brentq
 
 from fem import surface
 from fem.contact import recovery
+from fem.emulator_limits import check, within
 from fem.mesh import Geometry
-from fem.model import Inclusion, NotModelled, Probe, Slab
+from fem.model import Inclusion, Probe, Slab
 from fem.regression import Regression
-from fem.sampling import CLEARANCE, Plan, clearance, contrast, lines, quadratic
+from fem.sampling import CLEARANCE, Plan, contrast, lines, quadratic
 from fem.solving import knots
 from fem.topology import Resolution
 
@@ -183,7 +184,7 @@ class Emulator:
         """The indentation asked for, or the one that takes the force, mm."""
         low, high = self.plan.ranges.indentation_mm
         if indentation is not None:
-            _within("indentation", indentation, (low, high), "mm")
+            within("indentation", indentation, (low, high), "mm")
             return float(indentation)
         assert force is not None
 
@@ -192,73 +193,10 @@ class Emulator:
             return 1e-3 * float((found["pressure"] * found["area"]).sum())
 
         ends = push(low), push(high)
-        _within("force", force, ends, "N")
+        within("force", force, ends, "N")
         if self.plan.mechanics == "linear":
             return force / ends[1] * high
         return float(brentq(lambda depth: push(depth) - force, low, high, xtol=1e-9))
-
-
-def check(
-    plan: Plan,
-    probe: Probe,
-    slab: Slab,
-    inclusion: Inclusion | None,
-    mechanics: str,
-    tilt: tuple[float, float],
-    position: tuple[float, float],
-) -> None:
-    """Refuse what an emulator was not built for (NotModelled), and what lies outside its ranges
-    (ValueError)."""
-    own = plan.slab(slab.thickness_mm, slab.modulus_kPa)
-    same = [*_parts(probe, plan.probe), ("mechanics", mechanics, plan.mechanics)]
-    same += [(f"slab.{k}", getattr(slab, k), getattr(own, k)) for k in ("width_mm", "poisson", "sides")]
-    same += [("tilt", tuple(tilt), (0.0, 0.0)), ("position", tuple(position), (0.0, 0.0))]
-    if inclusion is not None:
-        same.append(("inclusion.poisson", inclusion.poisson, plan.inner_poisson))
-        same.append(("inclusion.stretch", tuple(inclusion.stretch), (1.0, 1.0, 1.0)))
-    for name, received, allowed in same:
-        if received != allowed:
-            raise NotModelled(
-                f"{name}: received {received}; not in this emulator, which was built for {allowed}"
-            )
-    ranges = plan.ranges
-    _within("slab.thickness_mm", slab.thickness_mm, ranges.thickness_mm, "mm")
-    _within("slab.modulus_kPa", slab.modulus_kPa, ranges.tissue_kPa, "kPa")
-    if inclusion is None:
-        return
-    _within("inclusion.size", inclusion.size, ranges.size_mm, "mm")
-    _within("inclusion.depth", inclusion.depth, ranges.depth_mm, "mm")
-    _within("inclusion.modulus", inclusion.modulus, ranges.modulus_kPa, "kPa")
-    for part in inclusion.offset:
-        _within("inclusion.offset", part, (-ranges.offset_mm, ranges.offset_mm), "mm")
-    room = clearance(inclusion.size, inclusion.depth, slab.thickness_mm)
-    if room < 0:
-        reach = inclusion.size + inclusion.depth
-        raise ValueError(
-            f"inclusion.depth + inclusion.size: received {reach:g} mm; allowed in this emulator up to "
-            f"{reach + room:g} mm in a slab of {slab.thickness_mm:g} mm"
-        )
-
-
-def _parts(probe: Probe, own: Probe) -> list[tuple[str, object, object]]:
-    """Name, value and known value of each property of a probe."""
-    names = ("width_mm", "dome_radius_mm")
-    found: list[tuple[str, object, object]] = [
-        (f"probe.{k}", getattr(probe, k), getattr(own, k)) for k in names
-    ]
-    found.append(("probe.layers", len(probe.layers), len(own.layers)))
-    for number, pair in enumerate(zip(probe.layers, own.layers, strict=False)):
-        found += [(f"probe.layers.{number}.{k}", *(getattr(la, k) for la in pair)) for k in vars(pair[0])]
-    return found
-
-
-def _within(name: str, value: float, allowed: tuple[float, float], unit: str) -> None:
-    low, high = allowed
-    slack = 1e-9 * max(abs(low), abs(high))
-    if not low - slack <= value <= high + slack:
-        raise ValueError(
-            f"{name}: received {value:g} {unit}; allowed in this emulator {low:g} to {high:g} {unit}"
-        )
 
 
 def fields(emulator: Emulator, slab: Slab, inclusion: Inclusion | None, depth: float) -> dict[str, Floats]:

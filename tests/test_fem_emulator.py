@@ -12,8 +12,9 @@ from numpy.lib.format import write_array
 
 import fem
 from fem.emulating import build_emulator, fit
-from fem.emulator import Emulator, check, lagrange, resample, signal, unfold
+from fem.emulator import Emulator, lagrange, resample, signal, unfold
 from fem.emulator_file import NotAnEmulator, load_emulator, save_emulator
+from fem.emulator_limits import check
 from fem.regression import Regression, regress
 from fem.sampling import Plan, Ranges, background, geometry_at, quadratic, solve
 from fem.solving import knots

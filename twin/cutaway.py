@@ -92,7 +92,7 @@ def _bodies(axes: Axes, frame: Pictured, mesh: pv.PolyData) -> tuple[Floats, Flo
     axes.add_collection(
         PolyCollection(moved[quads(mesh)], facecolors=fill, edgecolors="#00000030", linewidths=0.2)
     )
-    return moved, _wall(frame, mesh, moved)
+    return moved, _wall(frame, moved)
 
 
 def _outline(axes: Axes, frame: Pictured) -> tuple[Floats, Floats]:
@@ -132,9 +132,10 @@ def _outline(axes: Axes, frame: Pictured) -> tuple[Floats, Floats]:
     return tissue, np.array([[-side, deep], [side, deep]])
 
 
-def _wall(frame: Pictured, mesh: pv.PolyData, moved: Floats) -> Floats:
+def _wall(frame: Pictured, moved: Floats) -> Floats:
     """Ends of the chest wall's face, (2, 2) mm of x and z, by rising x; level but for a tilted press."""
-    points = np.asarray(mesh.points, float)
+    assert frame.cut is not None
+    points = np.asarray(frame.cut.points, float)
     about_x, about_y = np.radians(frame.press["tilt_deg"])
     # the specimen's depth axis in the frame of a probe that was turned about x, then y
     deep = points @ [-np.sin(about_y), np.cos(about_y) * np.sin(about_x), np.cos(about_y) * np.cos(about_x)]
