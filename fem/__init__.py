@@ -13,12 +13,17 @@ from fem.scalars import scalars
 
 if TYPE_CHECKING:
     from fem.ccx import deck
+    from fem.emulating import build_emulator
+    from fem.emulator import Emulated, Emulator
+    from fem.emulator_file import load_emulator, save_emulator
     from fem.plane import Press2D, press_2d
     from fem.plane_scalars import scalars_2d
     from fem.pressing import Press, press, press_moduli
     from fem.volume import save_volume, volume_grid
 
 __all__ = [
+    "Emulated",
+    "Emulator",
     "Inclusion",
     "Layer",
     "NotConverged",
@@ -28,10 +33,13 @@ __all__ = [
     "Press2D",
     "Probe",
     "Slab",
+    "build_emulator",
     "deck",
+    "load_emulator",
     "press",
     "press_2d",
     "press_moduli",
+    "save_emulator",
     "save_volume",
     "scalars",
     "scalars_2d",
@@ -39,13 +47,18 @@ __all__ = [
 ]
 
 _LATER = {
-    "deck": "ccx",
+    "Emulated": "emulator",
+    "Emulator": "emulator",
     "Press": "pressing",
+    "deck": "ccx",
+    "build_emulator": "emulating",
+    "load_emulator": "emulator_file",
     "press": "pressing",
     "press_moduli": "pressing",
     "Press2D": "plane",
     "press_2d": "plane",
     "scalars_2d": "plane_scalars",
+    "save_emulator": "emulator_file",
     "save_volume": "volume",
     "volume_grid": "volume",
 }

@@ -124,7 +124,8 @@ class Body:
     @cached_property
     def floor(self) -> float:
         """Residual that is rounding, mN: what the largest entries leave after they cancel."""
-        kind, largest = self.rest.matrices.dtype, float(np.abs(self.rest.matrices).max())
+        entries = self.rest.matrices  # hundreds of megabytes: no copy of them
+        kind, largest = entries.dtype, float(max(entries.max(), -entries.min()))
         double = kind == np.float64 or self.finite  # finite strain's forces do not come from the matrices
         return (1e4 * float(np.finfo(np.float64).eps) if double else 20 * float(np.finfo(kind).eps)) * largest
 

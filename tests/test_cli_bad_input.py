@@ -81,6 +81,22 @@ FLAGS = {
         ["--size", "10.0", "22.5 mm", "24 mm"],
     ),
     "unknown mechanics": ([*FINE, "--mechanics", "plastic"], ["--mechanics", "'plastic'", "finite, linear"]),
+    "an emulator that is not there": (
+        [*FINE, "--mechanics", "emulator", "--emulator", "no/such.npz"],
+        ["--emulator", "'no/such.npz'", "twin emulate"],
+    ),
+    "an emulator that is none": (
+        [*FINE, "--mechanics", "emulator", "--emulator", "."],
+        ["--emulator", "'.'", "twin emulate"],
+    ),
+    "an emulator without its mechanics": (
+        [*FINE, "--emulator", "a.npz"],
+        ["--emulator", "--mechanics emulator"],
+    ),
+    "export by an emulator": (
+        [*EXPORT, "--mechanics", "emulator", "--vtu", "a.vtu"],
+        ["--mechanics", "finite, linear"],
+    ),
     "export of nothing": (EXPORT, ["--vtu, --ccx", "nothing", "one of them"]),
     "export of two": ([*EXPORT, "--vtu", "a.vtu", "--ccx", "a"], ["--ccx", "--vtu"]),
     "a deck that comes back up": (

@@ -97,6 +97,16 @@ def test_scene_is_readable_and_whole(scene):
     assert transmitted.min() >= 0.0 and 0.9 < transmitted.max() <= 1.0
 
 
+def test_what_the_scene_leaves_out_is_said(tmp_path):
+    """The shipped white design has spectra; its scene is one wavelength, and says so."""
+    folder = tmp_path / "scene"
+    bare = ["export", "white", "--no-inclusion", "--mechanics", "linear", "--quality", "preview"]
+    assert cli.main([*bare, "--indentation", "1", "--mitsuba", str(folder)]) == 0
+    told = (folder / "README.txt").read_text()
+    assert "spectra (all is at" in told and "sideways in the tissue" in told and "no inclusion" in told
+    assert "paint" not in told and "absorption" not in told
+
+
 @pytest.mark.parametrize("fault", ["missing", "pickled", "flat", "not shares"])
 def test_a_bad_table_is_refused_in_one_line(variant, tmp_path, fault):
     import mitsuba as mi

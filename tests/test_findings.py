@@ -88,7 +88,13 @@ CASES = {
         "leds.0.gap_mm, leds.1.gap_mm",
         "30 %",
     ),
-    "light leaks": (share(sound(), "first", {"leaked": 20.0}), "warning", "leds.*.coupling", "too steeply"),
+    "light leaks": (share(sound(), "first", {"leaked": 20.0}), "warning", "leds.*.z_mm", "too steeply"),
+    "an LED below": (
+        share(led(1, side="below"), "first", {"leaked": 80.0}, 1),
+        "warning",
+        "leds.1.side",
+        "Move it to a side face",
+    ),
     "an LED in the rim's shade": (led(2, z_mm=-1.0), "error", "leds.2.z_mm", "Put it at -1.35 mm or lower"),
     "a guide that air sees through": (
         at("waveguide", refractive_index=1.38),

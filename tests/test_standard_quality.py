@@ -44,8 +44,8 @@ def pictures(name: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def compared(standard: np.ndarray, runs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Relative difference, per cent, of standard and reference, and its standard error; means over the leading
-    axis are the reference's."""
+    """Relative difference, per cent, of standard and reference, and its standard error; over the leading
+    axis the reference is averaged."""
     mean, error = runs.mean(axis=0), runs.std(axis=0, ddof=1) / np.sqrt(len(runs))
     return 100 * (standard / mean - 1), 100 * error / mean
 

@@ -34,6 +34,7 @@ examples:
   twin simulate tsis --size 8 --depth 5 --modulus 120 --indentation 1 2 3 --seed 7 --out levels
   twin simulate tsis --size 10 --depth 5 --modulus 100 --offset 3 0 --tilt 0 2 --out tilted
   twin simulate my-sensor.toml --no-inclusion --force 0.5 --mechanics linear --out flat
+  twin simulate --size 9 --depth 6 --modulus 80 --mechanics emulator --emulator tsis.npz --out quick
 """
 
 _CHECK = """\
@@ -64,6 +65,16 @@ examples:
   twin export tsis --size 10 --depth 5 --modulus 100 --indentation 1 2 3 --ccx decks
   twin export tsis --size 10 --depth 5 --modulus 100 --mitsuba scene
   twin export tsis --no-inclusion --ply meshes
+"""
+
+_EMULATE = """\
+Learn the contact field of a design's sensor, so that a press takes milliseconds: solve many specimens
+around the design's, fit, and say how far held-out ones are off. What was solved is kept in FILE.npz.samples:
+the same command goes on with it, also after Ctrl-C.
+
+examples:
+  twin emulate tsis --minutes 30 --out emulators/tsis.npz
+  twin emulate my-sensor.toml --samples 400 --workers 2 --out mine.npz
 """
 
 _SCHEMA = """\
@@ -104,7 +115,10 @@ def _parser() -> Parser:
         "design", metavar="DESIGN", nargs="?", default="tsis", help="name or TOML file (default tsis)"
     )
     _add_inclusion_flags(simulate)
-    _add_pose_flags(simulate)
+    _add_pose_flags(simulate, "emulator")
+    simulate.add_argument(
+        "--emulator", metavar="FILE.npz", help="for --mechanics emulator (default emulators/DESIGN.npz)"
+    )
     press = simulate.add_mutually_exclusive_group()
     _add_depths(press)
     press.add_argument(
@@ -116,7 +130,7 @@ def _parser() -> Parser:
     check.add_argument(
         "design", metavar="DESIGN", nargs="?", default="tsis", help="name or TOML file (default tsis)"
     )
-    _add_mechanics_flag(check, "linear")
+    _add_mechanics_flag(check, default="linear")
     check.add_argument(
         "--indentation",
         type=number(above=0.0),
@@ -141,6 +155,17 @@ def _parser() -> Parser:
     kind.add_argument("--stl", metavar="DIR", help="one press as STL meshes")
     kind.add_argument("--ply", metavar="DIR", help="one press as PLY meshes with fields")
     _add_quality_flag(export)
+
+    emulate = _verb(verbs, "emulate", "an emulator of a sensor's contact field", _EMULATE)
+    emulate.add_argument("design", metavar="DESIGN", nargs="?", default="tsis", help="name or TOML file")
+    _add_mechanics_flag(emulate)
+    emulate.add_argument(
+        "--minutes", type=number(above=0.0), metavar="MIN", help="time to solve for (default 30)"
+    )
+    emulate.add_argument("--samples", type=whole, metavar="N", help="stop at so many samples")
+    emulate.add_argument("--workers", type=whole, metavar="N", help="processes (default: all cores)")
+    emulate.add_argument("--seed", type=whole, default=0, metavar="N", help="of the samples (default 0)")
+    emulate.add_argument("--out", metavar="FILE.npz", help="the file to write")
 
     _verb(verbs, "schema", "the JSON schema of a design file", _SCHEMA)
     return parser
@@ -173,20 +198,20 @@ def _add_inclusion_flags(parser: Parser) -> None:
     parser.add_argument("--no-inclusion", action="store_true", help="homogeneous tissue")
 
 
-def _add_pose_flags(parser: Parser) -> None:
-    _add_mechanics_flag(parser)
+def _add_pose_flags(parser: Parser, *more: str) -> None:
+    _add_mechanics_flag(parser, *more)
     _add_pair(parser, "--tilt", "turn of the sensor about x, then y, degrees (default: the design's)")
     _add_pair(parser, "--position", "sensor's centre minus the specimen's, mm (default: the design's)")
 
 
-def _add_mechanics_flag(parser: Parser, default: str | None = None) -> None:
-    otherwise = default or "the design's"
+def _add_mechanics_flag(parser: Parser, *more: str, default: str | None = None) -> None:
+    words = " or ".join(MECHANICS) + " strain" + "".join(f", or {word}" for word in more)
     parser.add_argument(
         "--mechanics",
-        type=choice(*MECHANICS),
+        type=choice(*MECHANICS, *more),
         default=default,
         metavar="M",
-        help=f"{' or '.join(MECHANICS)} strain (default: {otherwise})",
+        help=f"{words} (default: {default or 'the design' + chr(39) + 's'})",
     )
 
 

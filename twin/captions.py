@@ -20,7 +20,18 @@ def inclusion_in_words(inclusion: Any) -> str:
     return f"{width}, {inclusion.depth:g} mm deep (to its top), {inclusion.modulus:g} kPa"
 
 
+_STRAIN = {"finite": "finite strain", "linear": "linear"}
+
+
 def mechanics_in_words(fem: Mapping[str, Any]) -> str:
     """Return how a press was computed from ``mechanics`` and ``path`` of its frame."""
-    strain = {"finite": "finite strain", "linear": "linear"}.get(fem["mechanics"], fem["mechanics"])
-    return f"{strain}, {_CONTACT.get(fem['path'], fem['path'])}"
+    if fem["mechanics"] == "emulator":
+        return f"emulator ({_STRAIN.get(fem['emulated'], fem['emulated'])})"
+    return f"{_STRAIN.get(fem['mechanics'], fem['mechanics'])}, {_CONTACT.get(fem['path'], fem['path'])}"
+
+
+def error_in_words(fem: Mapping[str, Any]) -> str:
+    """Return what ``error_percent`` of a frame is: of the mesh, or of an emulator."""
+    return (
+        "held-out error (95 %), tared" if fem["mechanics"] == "emulator" else "error estimate, tared surface"
+    )

@@ -1,4 +1,4 @@
-"""The command line: ``twin demo``, ``simulate``, ``check``, ``export``, ``schema``.
+"""The command line: ``twin demo``, ``simulate``, ``check``, ``export``, ``emulate``, ``schema``.
 
 Exit status 0: done; 1: the machine failed (a full disk); 2: bad input, one line on stderr; 130: interrupted.
 Nothing slow is imported until the input has been checked.
@@ -46,6 +46,7 @@ _FLAGS = {
     "press.tilt_deg": "--tilt",
     "press.position_mm": "--position",
     "mechanics": "--mechanics",
+    "emulator": "--emulator",
     "vtu": "--vtu",
     "ccx": "--ccx",
     "mitsuba": "--mitsuba",
@@ -77,7 +78,8 @@ def main(argv: list[str] | None = None) -> int:
     except (DesignError, fem.NotModelled, fem.NotConverged, NotModelled, BackendError) as error:
         return _fail(name, _with_flags(str(error)), 2)
     except KeyboardInterrupt:
-        return _fail(name, "interrupted; nothing was written", 130)
+        kept = "what was solved is kept" if arguments.verb == "emulate" else "nothing was written"
+        return _fail(name, f"interrupted; {kept}", 130)
     except BrokenPipeError:  # `twin schema | head`
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115 (Python flushes it on its way out)
         return 0
@@ -100,13 +102,21 @@ def _run(arguments: argparse.Namespace) -> int:
         design = load_design("tsis")
         _simulate(arguments, design, DEMO_INCLUSION, design.press.indentation_mm)
     elif arguments.verb == "simulate":
+        options = Options()
+        if arguments.mechanics == "emulator":
+            options = Options(mechanics="emulator", emulator=arguments.emulator)
+            arguments.mechanics = None
+        elif arguments.emulator is not None:
+            raise DesignError("--emulator", "it with other mechanics", "it with --mechanics emulator only")
         design, inclusion = _pressed(arguments), _inclusion(arguments)
         levels = arguments.force or arguments.indentation or design.press.indentation_mm
-        _simulate(arguments, design, inclusion, levels, by_force=bool(arguments.force))
+        _simulate(arguments, design, inclusion, levels, bool(arguments.force), options)
     elif arguments.verb == "check":
         _check(arguments)
     elif arguments.verb == "export":
         _export(arguments, _pressed(arguments), _inclusion(arguments))
+    elif arguments.verb == "emulate":
+        _emulate(arguments)
     else:
         parse(["--help"])
     return 0
@@ -118,6 +128,7 @@ def _simulate(
     inclusion: fem.Inclusion | None,
     levels: Sequence[float],
     by_force: bool = False,
+    mechanics: Options | None = None,
 ) -> None:
     if arguments.out is None:
         raise DesignError("out", "nothing", "the folder to make for the results")
@@ -135,6 +146,7 @@ def _simulate(
             seed=arguments.seed,
             device=arguments.device,
             progress=tell,
+            **(mechanics or {}),
         )
         if by_force:
             frames = simulate(design, inclusion, force=levels, **options)
@@ -227,6 +239,34 @@ def _telling() -> Iterator[Callable[[str, float], None]]:
             report(stage, done)
 
         yield tell
+
+
+def _emulate(arguments: argparse.Namespace) -> None:
+    from twin.emulate import emulate, summary
+    from twin.reporting import Reporter
+
+    if arguments.out is None:
+        raise DesignError("--out", "nothing", "the file to write")
+    for flag in ("samples", "workers"):
+        if getattr(arguments, flag) == 0:
+            raise DesignError(f"--{flag}", "0", "an integer > 0")
+    design = load_design(arguments.design).pressed(mechanics=arguments.mechanics)
+    with Reporter() as report:
+
+        def tell(stage: str, done: float) -> None:
+            interrupt.stop_if_asked()
+            report("solves" if stage[-1].isdigit() else stage, done)
+
+        built = emulate(
+            design,
+            arguments.out,
+            minutes=arguments.minutes,
+            samples=arguments.samples,
+            workers=arguments.workers,
+            seed=arguments.seed,
+            progress=tell,
+        )
+    print(summary(built, arguments.out))
 
 
 def _pressed(arguments: argparse.Namespace) -> Design:

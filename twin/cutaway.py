@@ -3,19 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
-from matplotlib.patches import Polygon, Rectangle
+from matplotlib.patches import Ellipse, Polygon, Rectangle
 from matplotlib.ticker import MaxNLocator
 from matplotlib.tri import LinearTriInterpolator, Triangulation
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
 from twin.frame import grey
-from twin.panels import FAINT, INCLUSION, INK, INNER, LED, ROUND, Pictured, quads, scale_bar, triangles
+from twin.panels import (
+    DASHED,
+    FAINT,
+    INCLUSION,
+    INK,
+    INNER,
+    LED,
+    ROUND,
+    Pictured,
+    quads,
+    scale_bar,
+    triangles,
+)
+
+if TYPE_CHECKING:
+    import pyvista as pv
+
+Floats = NDArray[np.float64]
 
 TISSUE, GLASS, WALL, PRESSURE = "#f3ddcf", "#d5e8df", "#d0d0d0", "#2b6ca3"
 LAYERS = ("#deebf7", "#9ecae1", "#4a90c4", "#2b6ca3", "#1f4e79")
@@ -23,21 +40,15 @@ LAYERS = ("#deebf7", "#9ecae1", "#4a90c4", "#2b6ca3", "#1f4e79")
 
 def draw_cut(axes: Axes, frame: Pictured, letter: str) -> None:
     """Cut through the middle of probe and inclusion, in the probe's frame, true to scale: glass at rest,
-    specimen pushed towards it. Nodes off the plane y = 0 are drawn where they are seen from the side."""
-    design, mesh = frame.design, frame.cut
+    specimen pushed towards it. Nodes off the plane y = 0 are drawn where they are seen from the side.
+
+    Without a cut, as an emulator's frames are, only the contact line is drawn as deformed."""
+    design = frame.design
     layers = design.waveguide.layers
     half = design.waveguide.width_mm / 2
-    colours = np.array([TISSUE, INCLUSION, *(LAYERS[i % len(LAYERS)] for i in range(len(layers)))])
-    material = np.asarray(mesh.cell_data["material"]).astype(int)
-    if frame.inclusion is None:  # the mesh may keep its sphere of cells; the tissue has none
-        material = np.where(material == 1, 0, material)
-    moved = (np.asarray(mesh.points) + np.asarray(mesh.point_data["displacement"]))[:, [0, 2]]
-    fill = list(colours[material])
-    axes.add_collection(
-        PolyCollection(moved[quads(mesh)], facecolors=fill, edgecolors="#00000030", linewidths=0.2)
-    )
+    moved, wall = _outline(axes, frame) if frame.cut is None else _bodies(axes, frame, frame.cut)
     bottom = -sum(layer.thickness_mm for layer in layers)
-    glass, wall = design.glass.thickness_mm, _wall(frame, moved)
+    glass = design.glass.thickness_mm
     edge: dict[str, Any] = {"edgecolor": INK, "lw": 0.5}
     axes.add_patch(Rectangle((-half, bottom - glass), 2 * half, glass, facecolor=GLASS, **edge))
     hatch: dict[str, Any] = {"facecolor": WALL, "edgecolor": "#9a9a9a", "hatch": "////", "lw": 0.5}
@@ -65,11 +76,66 @@ def draw_cut(axes: Axes, frame: Pictured, letter: str) -> None:
     title = f"Cut at y = 0 under a press of {indentation:.2f} mm (deformation × 1)"
     if y:
         title = f"Cut through the inclusion (y = {y:g} mm), pressed {indentation:.2f} mm"
+    if frame.cut is None:
+        title = f"At y = {y:g} mm, pressed {indentation:.2f} mm; dashed: not computed"
     axes.set_title(f"{letter}  {title}")
 
 
-def _wall(frame: Pictured, moved: NDArray[np.float64]) -> NDArray[np.float64]:
+def _bodies(axes: Axes, frame: Pictured, mesh: pv.PolyData) -> tuple[Floats, Floats]:
+    """Draw the deformed mesh of the cut; its nodes (n, 2) mm of x and z, and the ends of the chest wall."""
+    count = len(frame.design.waveguide.layers)
+    colours = np.array([TISSUE, INCLUSION, *(LAYERS[i % len(LAYERS)] for i in range(count))])
+    material = np.asarray(mesh.cell_data["material"]).astype(int)
+    if frame.inclusion is None:  # the mesh may keep its sphere of cells; the tissue has none
+        material = np.where(material == 1, 0, material)
+    moved = (np.asarray(mesh.points) + np.asarray(mesh.point_data["displacement"]))[:, [0, 2]]
+    fill = list(colours[material])
+    axes.add_collection(
+        PolyCollection(moved[quads(mesh)], facecolors=fill, edgecolors="#00000030", linewidths=0.2)
+    )
+    return moved, _wall(frame, moved)
+
+
+def _outline(axes: Axes, frame: Pictured) -> tuple[Floats, Floats]:
+    """Draw the contact line as deformed, and dashed, moved with the chest wall alone, what an emulator does
+    not know: the tissue's free surface, the layers and the inclusion. Returns as `_bodies`."""
+    design, found, down = frame.design, frame.inclusion, frame.press["indentation_mm"]
+    half, side = design.waveguide.width_mm / 2, design.specimen.width_mm / 2
+    deep, y = design.specimen.thickness_mm - down, 0.0 if found is None else found.offset[1]
+    x = np.linspace(-half, half, 401)[1:-1]
+    displacement = np.asarray(frame.surface.point_data["displacement"], float)
+    line = np.stack(
+        [x + _along_x(frame, displacement[:, 0], x, y), _along_x(frame, displacement[:, 2], x, y)], 1
+    )
+    rims = [(line[0, 0], -down), (line[-1, 0], -down)]
+    tissue = np.array([(-side, -down), rims[0], *line, rims[1], (side, -down), (side, deep), (-side, deep)])
+    axes.add_patch(Polygon(tissue, closed=True, facecolor=TISSUE, edgecolor="none"))
+    top = [*line]
+    depth = 0.0
+    for number, layer in enumerate(design.waveguide.layers):
+        depth -= layer.thickness_mm
+        low = np.array([[-half, depth], [half, depth]])
+        colour = LAYERS[number % len(LAYERS)]
+        axes.add_patch(Polygon([*top, *low[::-1]], closed=True, facecolor=colour, edgecolor="none"))
+        if number + 1 < len(design.waveguide.layers):
+            axes.plot(*low.T, color=INK, lw=0.6, ls=DASHED)
+        top = [*low]
+    axes.plot(*line.T, color=INK, lw=1.0)
+    for rim, end in zip(rims, (-side, side), strict=True):
+        axes.plot([end, rim[0]], [-down, -down], color=INK, lw=0.6, ls=DASHED)
+    if found is not None:
+        centre = (found.offset[0], found.centre_mm - down)
+        style: dict[str, Any] = {"facecolor": "none", "edgecolor": INCLUSION, "lw": 1.0, "ls": DASHED}
+        axes.add_patch(Ellipse(centre, 2 * found.radii_mm[0], 2 * found.radii_mm[2], **style))
+        text = f"inclusion\n{found.modulus:g} kPa"
+        right = (centre[0] + found.radii_mm[0] + 1, centre[1])
+        axes.text(*right, text, ha="left", va="center", color=INCLUSION, linespacing=1.1)
+    return tissue, np.array([[-side, deep], [side, deep]])
+
+
+def _wall(frame: Pictured, moved: Floats) -> Floats:
     """Ends of the chest wall's face, (2, 2) mm of x and z, by rising x; level but for a tilted press."""
+    assert frame.cut is not None
     points = np.asarray(frame.cut.points, float)
     about_x, about_y = np.radians(frame.press["tilt_deg"])
     # the specimen's depth axis in the frame of a probe that was turned about x, then y
@@ -105,8 +171,8 @@ def _name_the_parts(axes: Axes, frame: Pictured, bottom: float, wall: NDArray[np
     )
     at_rest = "drawn with the probe at rest; the chest wall comes down"
     axes.text(middle[0], wall[:, 1].max() + 6.4, at_rest, fontsize=6.5, ha="center", va="top", color=FAINT)
-    if frame.inclusion is not None:
-        _name_the_inclusion(axes, frame)
+    if frame.inclusion is not None and frame.cut is not None:
+        _name_the_inclusion(axes, frame, frame.cut)
     parts, top = [], 0.0
     for layer in design.waveguide.layers:
         text = f"PDMS {layer.modulus_kPa:g} kPa, {layer.thickness_mm:g} mm"
@@ -127,8 +193,8 @@ def _name_the_parts(axes: Axes, frame: Pictured, bottom: float, wall: NDArray[np
     scale_bar(axes, min(left, -half - 14), bottom - glass + 0.4, 10.0, INK)
 
 
-def _name_the_inclusion(axes: Axes, frame: Pictured) -> None:
-    found, mesh = frame.inclusion, frame.cut
+def _name_the_inclusion(axes: Axes, frame: Pictured, mesh: pv.PolyData) -> None:
+    found = frame.inclusion
     text = f"inclusion\n{found.modulus:g} kPa"
     inside = quads(mesh)[np.asarray(mesh.cell_data["material"]) == 1]
     if not inside.size:  # off the plane of the cut

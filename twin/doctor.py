@@ -41,6 +41,7 @@ _LIGHT_PATHS = 2**17  # per LED, for the balance; the other pictures take half o
 _MORE = 4  # times as many, where the balance is off by more than
 _ROUGH_PERCENT = 0.15
 _SAMPLE_PATHS = 2**12  # per LED, recorded
+_PLACE_MM = 0.5
 _NOISE_FRAMES, _NOISE_REACH = 8, 7  # pictures, and pixels about the signal, that tell the camera's noise
 
 Array = NDArray[np.float64]
@@ -60,8 +61,8 @@ class Exposure:
 class Signal:
     """What the standard inclusion adds to the picture.
 
-    ``counts`` is the largest 3 x 3 mean of the tared picture; ``noise_dn`` the standard deviation of one
-    pixel's noise there, in one frame; ``at_px`` its row and column.
+    ``counts`` is the 3 x 3 mean of the tared picture where that is brightest; ``noise_dn`` the standard
+    deviation of one pixel's noise there, in one frame; ``at_px`` its row and column.
     """
 
     counts: float
@@ -157,7 +158,8 @@ def check_up(
     tell("setting up", 0.0)
     from scenes import SpectralRenderer
 
-    renderer = SpectralRenderer(design.sensor(), count=design.light.bands, at=design.sensor, device=device)
+    # one band for each spectrum: shares and counts change by a per cent or two with more
+    renderer = SpectralRenderer(design.sensor(), count=1, at=design.sensor, device=device)
     failures: list[str] = []
     tell("mechanics", 0.15)
     press, has_inclusion = _press(design, depth, failures)
@@ -359,8 +361,12 @@ def _signal(design: Design, standard: Rendering, blank: Rendering, seed: int) ->
     top = 2**camera.bits - 1
     tared = np.minimum(mean_counts(camera, lit, wavelength), top)
     tared -= np.minimum(mean_counts(camera, unlit, wavelength), top)
-    smooth = uniform_filter(grey(tared), 3, mode="nearest")
-    row, column = np.unravel_index(int(smooth.argmax()), smooth.shape)
+    tared = grey(tared)
+    # where half a millimetre is brightest: the brightest pixels alone would be the light's Monte Carlo noise
+    pixel = camera.field_of_view_mm / camera.columns, camera.field_height_mm / camera.rows
+    window = [max(round(_PLACE_MM / pixel[1]), 1), max(round(_PLACE_MM / pixel[0]), 1)]
+    row, column = np.unravel_index(int(uniform_filter(tared, window, mode="nearest").argmax()), tared.shape)
+    counts = uniform_filter(tared, 3, mode="nearest")[row, column]
     rng = np.random.default_rng(seed)
     rows = slice(max(row - _NOISE_REACH, 0), row + _NOISE_REACH + 1)
     columns = slice(max(column - _NOISE_REACH, 0), column + _NOISE_REACH + 1)
@@ -368,4 +374,4 @@ def _signal(design: Design, standard: Rendering, blank: Rendering, seed: int) ->
     frames = np.stack([grey(expose(camera, lit, wavelength, rng)[near]) for _ in range(_NOISE_FRAMES)])
     noise = float(np.sqrt(np.mean(np.var(frames, axis=0, ddof=1))))
     # a saturated pixel does not stir; the converter's step is always there
-    return Signal(float(smooth.max()), max(noise, 1.0 / np.sqrt(12.0)), (int(row), int(column)))
+    return Signal(float(counts), max(noise, 1.0 / np.sqrt(12.0)), (int(row), int(column)))

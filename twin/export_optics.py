@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -39,7 +39,7 @@ registers them, after a variant is set; they know llvm_ad_mono and cuda_ad_mono:
   scene = mi.load_file("scene.xml")
   picture = mi.render(scene, spp=64)        # slow: next-event estimation stops at the glass
 
-The tissue gives light back where it came in: `path` does not spread it sideways as the twin's pictures do.
+What is in the twin's own pictures but not in this scene: {left_out}.
 
 LLVM 15 and 16 abort the process: set DRJIT_LIBLLVM_PATH to a good one (19) first, or put
 `import scenes.backend; scenes.backend.use()` in place of the first two lines, which finds one.
@@ -106,6 +106,7 @@ def export(
             told = told.format(
                 version=_version(),
                 kind=kind,
+                left_out="; ".join(_left_out(design)),
                 fields=_FIELDS if kind == "ply" else "",
                 design=design.name,
                 inclusion=_in_words(inclusion),
@@ -116,6 +117,21 @@ def export(
     except DesignError as error:
         raise error.renamed(kind) if error.field == "out" else error from None
     return Path(name).absolute()
+
+
+def _left_out(design: Design) -> Iterator[str]:
+    """What stock `path` through this scene does not show of a design."""
+    guide, leds = design.waveguide, design.leds
+    yield "light that spreads sideways in the tissue (it comes back where it went in)"
+    yield "the lens's depth of field and vignetting (a pinhole takes its place)"
+    if guide.absorption_per_mm or design.glass.absorption_per_mm:
+        yield "absorption in guide and glass"
+    if guide.walls != "polished" and any(led.coupling == "air" for led in leds):
+        yield "paint on the side walls"
+    if any(led.pattern != "lambertian" for led in leds):
+        yield "the LEDs' patterns (they are Lambertian)"
+    if any(led.spectrum != "line" for led in leds):
+        yield f"the LEDs' spectra (all is at {design.light.wavelength_nm:g} nm)"
 
 
 def _write_scene(design: Design, deformed: OpticalSurface, folder: Path) -> str:

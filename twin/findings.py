@@ -18,6 +18,8 @@ from twin.doctor import STANDARD, Checkup
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from scenes.sensor import Led
+
 Rank = Literal["error", "warning", "note"]
 RANKS: tuple[Rank, ...] = ("error", "warning", "note")
 
@@ -127,24 +129,29 @@ def _leds(checkup: Checkup) -> Iterator[Finding]:
             "It is lost and makes stray light in a real housing",
             f"Bring it nearer than {gaps:g} mm, or nearer to the middle of the side, or embed it",
         )
-    for coupling, change in (
-        ("embedded", "Couple it through air at a flat side"),
-        ("air", "Put it lower, or raise the guide's index"),
+    for place, field, change in (
+        ("below", "side", "Move it to a side face, unless it is there to light what does not touch"),
+        ("embedded", "coupling", "Couple it through air at a flat side"),
+        ("air", "z_mm", "Put it lower, or raise the guide's index"),
     ):
         leaks = [
             number
             for number in lit
-            if checkup.first["leaked"][number] > _LEAKED and leds[number].coupling == coupling
+            if checkup.first["leaked"][number] > _LEAKED and _place(leds[number]) == place
         ]
         if leaks:
             yield Finding(
                 "warning",
-                _these(leaks, len(leds), ".coupling"),
+                _these(leaks, len(leds), f".{field}"),
                 f"{_span(checkup.first['leaked'][leaks])} % of its light meets the contact surface too "
                 "steeply to be trapped",
                 "It shines through without any contact: a bright background near the LED",
                 change,
             )
+
+
+def _place(led: Led) -> str:
+    return "below" if led.side == "below" else led.coupling
 
 
 def _these(numbers: Sequence[int], count: int, field: str) -> str:
@@ -182,12 +189,12 @@ def _indices(checkup: Checkup) -> Iterator[Finding]:
     sheet = design.surface.sheet
     behind, field = (sheet, "surface.sheet") if sheet else (design.specimen, "specimen")
     tissue = behind.refractive_index
-    air = [str(k) for k, led in enumerate(design.leds) if led.coupling == "air"]
+    air = [str(k) for k, led in enumerate(design.leds) if _place(led) == "air"]
     if air and n**2 - 1.0 < gap**2:
         yield Finding(
             "warning",
             "waveguide.refractive_index",
-            f"{n:g} lets light from LEDs in air (leds {', '.join(air)}) through the contact surface at once",
+            f"{n:.4g} lets light of LEDs in air (leds {', '.join(air)}) out through the contact surface",
             f"Only above {np.sqrt(1.0 + gap**2):.3f} is all light from a side face trapped by gaps of index "
             f"{gap:g}",
             "Take a guide of higher index" + (" or keep the gaps dry" if gap > 1.0 else ""),
@@ -198,14 +205,14 @@ def _indices(checkup: Checkup) -> Iterator[Finding]:
             "note",
             f"{field}.refractive_index",
             f"light flatter than {90 - angle:.0f}° to the surface stays trapped even where contact is full",
-            f"The {'sheet' if sheet else 'tissue'}'s index ({tissue:g}) is below the guide's ({n:g})",
+            f"The {'sheet' if sheet else 'tissue'}'s index ({tissue:g}) is below the guide's ({n:.4g})",
             "A guide of lower index, or LEDs that shine more steeply, use more of the light",
         )
     if n - gap < 0.05:
         yield Finding(
             "warning",
             "surface.gap_index",
-            f"{gap:g} is nearly the guide's {n:g}",
+            f"{gap:g} is nearly the guide's {n:.4g}",
             "Hardly any light is trapped, so that contact makes little contrast",
             "Keep the contact dry, or take a guide of higher index",
         )

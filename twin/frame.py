@@ -70,11 +70,13 @@ class Frame:
     """(rows, columns) displacement of the surface that each pixel looks at, mm; negative is pressed in."""
     surface: pyvista.PolyData
     """Contact surface, mm, with the point arrays of `fem.press`."""
-    cut: pyvista.PolyData
-    """Cut through the middle of probe and inclusion along x, mm, with the arrays of `fem.press`."""
+    cut: pyvista.PolyData | None
+    """Cut through the middle of probe and inclusion along x, mm, with the arrays of `fem.press`; None from an
+    emulator, which knows the contact surface only."""
     fem: dict[str, Any] = field(default_factory=dict)
     """Scalars ``raw`` and ``tared`` of the surface, ``min_pressure_kPa``, ``path``, ``mechanics``,
-    ``error_percent``, ``dof`` and ``seconds``, as `fem.Press` explains them."""
+    ``error_percent``, ``dof`` and ``seconds``, as `fem.Press` explains them. From an emulator, ``mechanics``
+    is "emulator", ``emulated`` what it learned ("finite" or "linear"), and ``dof`` None."""
     tsis: dict[str, Any] = field(default_factory=dict)
     """Scalars ``raw`` and ``tared`` of the picture, ``seconds``, ``noise_percent``, ``saturated_percent``."""
 

@@ -16,7 +16,7 @@ from twin.panels import INK
 
 # Fate of a path: colour, and words for the legend. What `scenes.paths` does not name yet is drawn black.
 FATES: dict[str, tuple[str, str]] = {
-    "tissue": ("#d7301f", "enters the tissue or sheet (bars: and stays there)"),
+    "tissue": ("#d7301f", "enters what it touches (bars: stays in it)"),
     "below": ("#08519c", "leaves below, a little of it into the camera"),
     "aside": ("#9e9e9e", "crosses the guide and leaves by a side face"),
     "missed": ("#d9d9d9", "goes by the guide, or is mirrored off its side"),

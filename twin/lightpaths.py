@@ -26,7 +26,8 @@ from twin.panels import FAINT, INK, LED
 from twin.pictures import DPI, HEIGHT_PX, STYLE, WIDTH_PX
 
 _LINES = 70  # in one panel, about
-_LEAST = 2  # of every fate that an LED has
+_LEAST = 2  # of every fate that an LED has; 1 where there are many LEDs
+_MANY = 6
 _BELOW_MM, _BESIDE_MM, _TISSUE_MM = 6.0, 6.0, 3.0  # drawn beyond the sensor
 _SIDES = {"x": 0, "y": 1}
 
@@ -41,30 +42,30 @@ def draw(checkup: Checkup, path: str | Path) -> None:
         state = f"pressed {checkup.indentation_mm:g} mm" if checkup.light_is_pressed else "untouched"
         title = f"Where the light goes: {checkup.design.name}, {state}"
         figure.text(0.017, 0.975, title, fontsize=12, fontweight="bold", va="center", parse_math=False)
-        note = f"sample paths that a photon may take; at least {_LEAST} of every fate: c has the true shares"
+        note = "sample paths that a photon may take; rare fates are drawn too often: c has the true shares"
         figure.text(0.017, 0.952, note, color=FAINT, va="center")
         side, above = _axes(figure, 75, 110, 1010, 470), _axes(figure, 75, 650, 490, 490)
         axis = _busiest_axis(checkup)
         _draw_side(side, checkup, axis)
         _draw_above(above, checkup)
-        draw_bars(_axes(figure, 1185, 110, 575, 420), checkup)
-        draw_first(_axes(figure, 1185, 640, 575, 220), checkup)
+        draw_bars(_axes(figure, 1205, 110, 555, 420), checkup)
+        draw_first(_axes(figure, 1205, 640, 555, 220), checkup)
         draw_legend(
-            figure.add_axes((600 / WIDTH_PX, 60 / HEIGHT_PX, 500 / WIDTH_PX, 490 / HEIGHT_PX)), checkup
+            figure.add_axes((590 / WIDTH_PX, 60 / HEIGHT_PX, 500 / WIDTH_PX, 490 / HEIGHT_PX)), checkup
         )
         write_facts(
-            figure.add_axes((1185 / WIDTH_PX, 40 / HEIGHT_PX, 575 / WIDTH_PX, 160 / HEIGHT_PX)), checkup
+            figure.add_axes((1205 / WIDTH_PX, 40 / HEIGHT_PX, 555 / WIDTH_PX, 160 / HEIGHT_PX)), checkup
         )
         stream = io.BytesIO()
         canvas.print_png(stream, metadata={"Software": None})
     write_bytes(path, stream.getvalue())
 
 
-def chosen(fate: NDArray[np.int64], count: int) -> NDArray[np.intp]:
-    """Places of about `count` paths of one LED: the first ones, and at least `_LEAST` of every fate."""
+def chosen(fate: NDArray[np.int64], count: int, least: int = _LEAST) -> NDArray[np.intp]:
+    """Places of about `count` paths of one LED: the first ones, and at least `least` of every fate."""
     kept = set(range(min(count, fate.size)))
     for kind in np.unique(fate):
-        kept |= set(np.flatnonzero(fate == kind)[:_LEAST].tolist())
+        kept |= set(np.flatnonzero(fate == kind)[:least].tolist())
     return np.array(sorted(kept), dtype=np.intp)
 
 
@@ -90,7 +91,7 @@ def _draw_paths(axes: Axes, checkup: Checkup, columns: tuple[int, int], leds: li
     ended = paths.fate != NAMES.index("going")  # what goes round and round would cover all else
     for number in leds:
         mine = np.flatnonzero((paths.led == number) & ended)
-        for place in mine[chosen(paths.fate[mine], each)]:
+        for place in mine[chosen(paths.fate[mine], each, _LEAST if len(leds) < _MANY else 1)]:
             corners = paths.vertices_mm[:, place]
             corners = corners[np.isfinite(corners[:, 0])][:, columns]
             lines.setdefault(NAMES[paths.fate[place]], []).append(corners)
@@ -128,14 +129,13 @@ def _draw_side(axes: Axes, checkup: Checkup, axis: str) -> None:
     )
     for sign in (-1, 1):  # the black frame about the glass
         axes.plot([sign * half] * 2, [lowest, bottom], color="black", lw=2, solid_capstyle="butt", zorder=4)
-    shown = [k for k, led in enumerate(design.leds) if led.side[-1] == axis or _is_below(led)]
+    shown = [k for k, led in enumerate(design.leds) if led.side[-1] == axis or led.side == "below"]
     _draw_paths(axes, checkup, (across, 2), shown)
-    for number in shown:
-        _led_from_the_side(axes, checkup, number, across)
+    _leds_from_the_side(axes, checkup, shown, across)
     _draw_camera(axes, checkup, across, lowest)
     aim: dict[str, Any] = {"fontsize": 7, "zorder": 20, "va": "center"}
     axes.text(-half - 0.6, top - _TISSUE_MM / 2, "tissue", ha="right", **aim)
-    axes.text(half + 1.2, bottom + 1.0, f"guide, n = {guide.refractive_index:g}", **aim)
+    axes.text(half + 1.2, bottom + 1.0, f"guide, n = {design.guide().refractive_index:.4g}", **aim)
     axes.text(half + 1.2, 0.5 * (bottom + lowest), f"glass, n = {glass.refractive_index:g}", **aim)
     axes.set_xlim(-half - _BESIDE_MM, half + _BESIDE_MM + 3)
     axes.set_ylim(lowest - _BELOW_MM, top)
@@ -146,33 +146,29 @@ def _draw_side(axes: Axes, checkup: Checkup, axis: str) -> None:
     axes.set_title(f"a  From the side: light of {which}" if shown else "a  From the side")
 
 
-def _led_from_the_side(axes: Axes, checkup: Checkup, number: int, across: int) -> None:
-    led: Any = checkup.design.leds[number]
-    half = checkup.design.waveguide.width_mm / 2
-    if _is_below(led):
-        corner = ((led.x_mm, led.y_mm)[across] - led.diameter_mm / 2, led.z_mm - 0.8)
-        axes.add_patch(Rectangle(corner, led.diameter_mm, 0.8, facecolor=LED, edgecolor=INK, lw=0.5))
-        return
-    sign = 1 if led.side[0] == "+" else -1
-    face = half + (led.gap_mm if led.coupling == "air" else -led.gap_mm)
-    body = Rectangle(
-        (min(sign * face, sign * (face + 0.8)), led.z_mm - led.diameter_mm / 2),
-        0.8,
-        led.diameter_mm,
-        facecolor=LED,
-        edgecolor=INK,
-        lw=0.5,
-        zorder=15,
-    )
-    axes.add_patch(body)
-    where = sign * (face + 1.1)
-    text = f"led {number}"
-    axes.text(where, led.z_mm, text, fontsize=6.5, va="center", ha="left" if sign > 0 else "right", zorder=20)
-
-
-def _is_below(led: Any) -> bool:
-    """Whether an LED shines from underneath."""
-    return str(led.side) == "below"
+def _leds_from_the_side(axes: Axes, checkup: Checkup, shown: list[int], across: int) -> None:
+    """The LEDs' bodies; those behind each other share a name."""
+    design = checkup.design
+    half = design.waveguide.width_mm / 2
+    floor = -design.waveguide.thickness_mm - design.glass.thickness_mm
+    names: dict[tuple[float, float, str], list[str]] = {}
+    for number in shown:
+        led = design.leds[number]
+        away = led.gap_mm if led.coupling == "air" else -led.gap_mm
+        if led.side == "below":
+            middle, top = (led.x_mm, led.y_mm)[across], floor - away
+            corner, size = (middle - led.diameter_mm / 2, top - 0.8), (led.diameter_mm, 0.8)
+            name = (middle, top - 1.4, "center")
+        else:
+            sign, face = (1 if led.side[0] == "+" else -1), half + away
+            corner = (min(sign * face, sign * (face + 0.8)), led.z_mm - led.diameter_mm / 2)
+            size = (0.8, led.diameter_mm)
+            name = (sign * (face + 1.1), led.z_mm, "left" if sign > 0 else "right")
+        axes.add_patch(Rectangle(corner, *size, facecolor=LED, edgecolor=INK, lw=0.5, zorder=15))
+        names.setdefault(name, []).append(str(number))
+    for (x, z, side), numbers in names.items():
+        text = f"led {', '.join(numbers)}"
+        axes.text(x, z, text, fontsize=6.5, va="center", ha=side, zorder=20)
 
 
 def _draw_camera(axes: Axes, checkup: Checkup, across: int, lowest: float) -> None:
@@ -231,10 +227,10 @@ def _draw_above(axes: Axes, checkup: Checkup) -> None:
             zorder=16,
         )
     )
-    led: Any
     for number, led in enumerate(design.leds):
-        if _is_below(led):
+        if led.side == "below":
             axes.add_patch(Circle((led.x_mm, led.y_mm), led.diameter_mm / 2, facecolor=LED, zorder=15))
+            axes.text(led.x_mm, led.y_mm, str(number), fontsize=6.5, ha="center", va="center", zorder=20)
             continue
         sign, along = (1 if led.side[0] == "+" else -1), _SIDES[led.side[-1]]
         face = half + (led.gap_mm if led.coupling == "air" else -led.gap_mm)

@@ -41,7 +41,7 @@ SINKS_IN_WORDS = {
     "aside": "leaves aside, or never enters",
 }
 _COLOURS = {"error": "bold red", "warning": "yellow", "note": "cyan"}
-_MOST_COLUMNS = 8  # of LEDs that a terminal has room for
+_LABEL, _COLUMN = 35, 9  # characters that a row's name and a column take
 
 
 def record(checkup: Checkup | None, found: Sequence[Finding], name: str) -> dict[str, Any]:
@@ -131,7 +131,7 @@ def show(checkup: Checkup | None, found: Sequence[Finding], name: str, *, as_jso
         return
     console = Console(highlight=False)
     if checkup is not None:
-        console.print(_balance(checkup))
+        console.print(_balance(checkup, console.width))
         console.print(_exposures(checkup))
         console.print(_signal(checkup), soft_wrap=True)
     else:
@@ -145,7 +145,7 @@ def show(checkup: Checkup | None, found: Sequence[Finding], name: str, *, as_jso
         console.print(f"[{colour}]{finding.rank:8}[/{colour}]{escape(str(finding))}", soft_wrap=True)
 
 
-def _balance(checkup: Checkup) -> Table:
+def _balance(checkup: Checkup, width: int) -> Table:
     design = checkup.design
     state = f"pressed {checkup.indentation_mm:g} mm" if checkup.light_is_pressed else "untouched"
     table = Table(
@@ -155,7 +155,7 @@ def _balance(checkup: Checkup) -> Table:
         padding=(0, 1, 0, 0),
     )
     table.add_column("", no_wrap=True)
-    shown = range(min(len(design.leds), _MOST_COLUMNS))
+    shown = range(min(len(design.leds), max((width - _LABEL) // _COLUMN - 1, 1)))
     for number in shown:
         led = design.leds[number]
         table.add_column(f"led {number}\n{led.side}\n{led.coupling}", justify="right", no_wrap=True)
@@ -181,8 +181,8 @@ def _balance(checkup: Checkup) -> Table:
     total = 100.0 * (checkup.emitted_W > 0) + checkup.closure_percent
     row(f"  together (100 ± {CLOSURE_PERCENT:g})", total, end_section=True)
     row("share of the picture's light", checkup.lit_percent, "{:.1f}")
-    if len(design.leds) > _MOST_COLUMNS:
-        table.caption = f"{len(design.leds) - _MOST_COLUMNS} more LEDs: see --json"
+    if len(design.leds) > len(shown):
+        table.caption = f"{len(design.leds) - len(shown)} more LEDs: see --json"
     return table
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -14,10 +15,23 @@ from twin.complaint import DesignError, shown
 from twin.design import Design
 
 if TYPE_CHECKING:
-    from fem import Press
+    from fem import Emulated, Emulator, Press
 
 Mechanics = Literal["finite", "linear"]
 Quality = Literal["preview", "standard", "reference"]
+
+EMULATORS = Path("emulators")
+"""Folder where a design's emulator is looked for: `tsis.npz` for the design `tsis`."""
+
+# What an emulator calls otherwise than a design.
+_NAMES = {
+    "probe.": "waveguide.",
+    "slab.": "specimen.",
+    "tilt": "press.tilt_deg",
+    "position": "press.position_mm",
+    "indentation": "press.indentation_mm",
+    "force": "press.force_N",
+}
 
 MIN_FORCE_N = 1e-4
 """Smallest press by force: far below what any camera sees."""
@@ -113,6 +127,61 @@ def solved(
     if by_force:
         _check_depth(design, presses, levels)
     return presses
+
+
+def emulator_of(design: Design, emulator: Emulator | str | Path | None) -> Emulator:
+    """Return the emulator itself or of a file, by default that of the design's name in `EMULATORS`.
+
+    Raises
+    ------
+    DesignError, fem.emulator_file.NotAnEmulator
+        In one line, where there is none, how to build one.
+    """
+    if emulator is None:
+        emulator = EMULATORS / f"{design.name}.npz"
+    if not isinstance(emulator, str | Path):
+        return emulator
+    try:
+        return fem.load_emulator(emulator)
+    except OSError:
+        allowed = f"a file that `twin emulate DESIGN --out {EMULATORS / 'NAME.npz'}` wrote"
+        raise DesignError("emulator", shown(str(emulator)), allowed) from None
+
+
+def emulated(
+    design: Design,
+    inclusion: fem.Inclusion | None,
+    levels: Sequence[float],
+    emulator: Emulator,
+    *,
+    by_force: bool = False,
+) -> list[Emulated]:
+    """Return the presses by an emulator, one for each level.
+
+    Raises
+    ------
+    fem.NotModelled
+        For what it was not built for, and outside of its ranges, in one line.
+    """
+    try:
+        return [
+            emulator(
+                design.probe(),
+                design.slab(),
+                inclusion,
+                None if by_force else level,
+                force=level if by_force else None,
+                tilt=design.press.tilt_deg,
+                position=design.press.position_mm,
+            )
+            for level in levels
+        ]
+    except ValueError as error:
+        field, colon, rest = str(error).partition(":")
+        for start, name in _NAMES.items():
+            if field == start or (start.endswith(".") and field.startswith(start)):
+                field = name + field.removeprefix(start)
+        raise fem.NotModelled(field + colon + rest) from None
 
 
 def _refuse_hopeless(design: Design, forces: Sequence[float]) -> None:

@@ -20,7 +20,7 @@ from twin.frame import Frame, grey
 from twin.presses import Mechanics, Quality
 
 if TYPE_CHECKING:
-    from fem import Press
+    from fem import Emulated, Emulator, Press
     from scenes import Rendering, SpectralRenderer
 
 Device = Literal["auto", "cpu", "cuda"]
@@ -53,7 +53,8 @@ class _Work:
 class Options(TypedDict, total=False):
     """What `simulate` takes beside the press, for whichever form of it."""
 
-    mechanics: Mechanics | None
+    mechanics: Mechanics | Literal["emulator"] | None
+    emulator: Emulator | str | Path | None
     tilt: Sequence[float] | None
     position: Sequence[float] | None
     quality: Quality
@@ -92,7 +93,8 @@ def simulate(
     indentation: float | Sequence[float] | None = None,
     *,
     force: float | Sequence[float] | None = None,
-    mechanics: Mechanics | None = None,
+    mechanics: Mechanics | Literal["emulator"] | None = None,
+    emulator: Emulator | str | Path | None = None,
     tilt: Sequence[float] | None = None,
     position: Sequence[float] | None = None,
     quality: Quality = "standard",
@@ -108,7 +110,10 @@ def simulate(
     inclusion : what lies in the tissue; None for homogeneous tissue.
     indentation : depth that the glass moves towards the chest wall, mm; by default the first of the design.
     force : force on the glass instead, N, along the sensor's axis.
-    mechanics : "finite" strain or "linear" elasticity, instead of the design's.
+    mechanics : "finite" strain or "linear" elasticity, instead of the design's; or "emulator": no solve, but
+        what an emulator learned from many.
+    emulator : with mechanics "emulator", a `fem.Emulator` or its file, by default "emulators/NAME.npz" with
+        the design's name; see `twin emulate`.
     tilt : turn of the sensor about x, then y, degrees, instead of the design's.
     position : centre of the sensor minus that of the specimen, mm, instead of the design's.
     quality : "preview", "standard" or "reference", for mechanics and light alike.
@@ -122,22 +127,31 @@ def simulate(
         In one line: what was received and what is allowed.
     """
     design = design if isinstance(design, Design) else load_design(design)
-    design = design.pressed(mechanics=mechanics, tilt_deg=tilt, position_mm=position)
+    solves = None if mechanics == "emulator" else mechanics
+    design = design.pressed(mechanics=solves, tilt_deg=tilt, position_mm=position)
     levels, by_force, several = presses.levels_of(design, indentation, force)
     check(design, inclusion, levels, by_force=by_force)
     seed = _seed(seed)
+    pressed: Sequence[Press | Emulated] | None = None
+    if mechanics == "emulator":
+        known = presses.emulator_of(design, emulator)
+        pressed = presses.emulated(design, inclusion, levels, known, by_force=by_force)
+    elif emulator is not None:
+        raise DesignError("emulator", "it with other mechanics", 'it with mechanics "emulator" only')
     from scenes import SpectralRenderer
 
     renderer = SpectralRenderer(design.sensor(), count=design.light.bands, at=design.sensor, device=device)
-    work = _Work(progress or (lambda stage, done: None), len(levels), _seconds(design, len(levels)))
-    pressed = presses.solved(
-        design,
-        inclusion,
-        levels,
-        by_force=by_force,
-        quality=quality,
-        progress=lambda stage, share: work.tell("mechanics", share),
-    )
+    seconds = _seconds(design, len(levels)) if pressed is None else 0.0
+    work = _Work(progress or (lambda stage, done: None), len(levels), seconds)
+    if pressed is None:
+        pressed = presses.solved(
+            design,
+            inclusion,
+            levels,
+            by_force=by_force,
+            quality=quality,
+            progress=lambda stage, share: work.tell("mechanics", share),
+        )
     frames = []
     for number, (level, press) in enumerate(zip(levels, pressed, strict=True)):
         stage = "light" if len(levels) == 1 else f"light {number + 1} of {len(levels)}"
@@ -179,7 +193,7 @@ def _seed(seed: SupportsIndex) -> int:
 def _frame(
     design: Design,
     inclusion: fem.Inclusion | None,
-    press: Press,
+    press: Press | Emulated,
     renderer: SpectralRenderer,
     quality: Quality,
     seed: int,
@@ -229,14 +243,14 @@ def _frame(
         pressure=np.maximum(lit.pressure, 0.0),
         displacement_z=lit.displacement_z,
         surface=press.surface,
-        cut=press.cut,
+        cut=getattr(press, "cut", None),
         fem={
             **fem.scalars(press.surface, design.signal.displacement_um),
             "min_pressure_kPa": press.min_pressure_kPa,
             "path": press.path,
-            "mechanics": press.mechanics,
+            **_mechanics(press),
             "error_percent": press.error_percent,
-            "dof": press.dof,
+            "dof": getattr(press, "dof", None),
             "seconds": press.seconds,
         },
         tsis={
@@ -249,7 +263,14 @@ def _frame(
     )
 
 
-def _how(design: Design, press: Press) -> dict[str, Any]:
+def _mechanics(press: Press | Emulated) -> dict[str, str]:
+    """Return who computed the press: an emulator is named besides what it learned."""
+    if press.path == "emulated":
+        return {"mechanics": "emulator", "emulated": press.mechanics}
+    return {"mechanics": press.mechanics}
+
+
+def _how(design: Design, press: Press | Emulated) -> dict[str, Any]:
     """Return depth, force and pose, as `frame.json` names them."""
     return {
         "indentation_mm": press.indentation_mm,

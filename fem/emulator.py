@@ -1,0 +1,343 @@
+"""A press without a solve: the whole contact field as a smooth function of specimen and indentation.
+
+An emulator knows one probe. It answers in a few milliseconds for the specimens within its ranges, refuses all
+others, and says how far held-out solves were from it. `fem.emulating` builds one, `fem.emulator_file` keeps
+it.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+import pyvista as pv
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+
+from fem import surface
+from fem.contact import recovery
+from fem.emulator_limits import check, within
+from fem.mesh import Geometry
+from fem.model import Inclusion, Probe, Slab
+from fem.regression import Regression
+from fem.sampling import CLEARANCE, Plan, contrast, lines, quadratic
+from fem.solving import knots
+from fem.topology import Resolution
+
+Floats = NDArray[np.float64]
+
+
+CENTRED = [0, 1, 4, 5, 6]
+"""The inputs that are no offsets: all that the gain from a finer mesh depends on, in the mesh's
+coordinates."""
+
+
+@dataclass(frozen=True)
+class Emulated:
+    """Answer of an emulator; fields as those of `fem.Press`, which it can stand in for where no cut is drawn.
+
+    Attributes
+    ----------
+    surface
+        The contact surface with `displacement`, `pressure`, `area` and, without inclusion, `displacement_0`,
+        `pressure_0`, `area_0`.
+    error_percent
+        95th percentile of what held-out solves of inclusions of this kind (thicker than 4 mm, or not) were
+        off by: largest error of the tared displacement, in per cent of its maximum.
+    """
+
+    surface: pv.PolyData
+    indentation_mm: float
+    indentation_0_mm: float
+    force_N: float
+    force_0_N: float
+    min_pressure_kPa: float
+    seconds: float
+    mechanics: str
+    error_percent: float
+    path: str = "emulated"
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors of the samples within the ranges, each left out of what was fitted, in per cent of the field's
+    own maximum.
+
+    `pressure` and `displacement` are of the tared fields on the whole contact surface: largest, and root
+    mean square over the area, the worst of all levels and moduli solved; (n, 2). `size_mm` (n,) is the
+    inclusion's. `finer` (p, 2): the same of what a finer mesh adds to the tared pressure. `curve` (rows, 7):
+    number of samples at small and at finite strain, core seconds they took, and of a common set of held-out
+    samples with `size_mm` >= 4 the median and the 95th percentile of the pressure's largest error, and of
+    its root mean square. `solves` (3, 2): of samples, of pairs of a fine and a lean mesh, and of samples at
+    finite strain, how many were tried, and how many of them failed and are missing from all this.
+    """
+
+    size_mm: Floats
+    pressure: Floats
+    displacement: Floats
+    finer: Floats
+    curve: Floats
+    solves: Floats
+
+    @property
+    def failed_percent(self) -> float:
+        """Share of the solves that failed, the worst kind's."""
+        return float(100 * (self.solves[:, 1] / np.maximum(self.solves[:, 0], 1)).max())
+
+    def percentile(self, name: str, percent: float, size_mm: float = 4.0, kind: int = 0) -> float:
+        """Of errors `name` ("pressure" or "displacement") of inclusions with their `size_mm` on this one's
+        side of 4 mm; kind 0: largest, 1: root mean square."""
+        same = (self.size_mm >= 4.0) == (size_mm >= 4.0)
+        found = getattr(self, name)[same, kind]
+        return float(np.percentile(found, percent)) if len(found) else float("nan")
+
+
+@dataclass(frozen=True)
+class Emulator:
+    """The contact field of one probe.
+
+    Attributes
+    ----------
+    plan
+        What was learned, and from which solves.
+    x
+        Lines of the answers' grid along x and y, (m,) mm.
+    pressure, moved
+        Background at the knots (i, j) of thickness and tissue, as `sampling.background` gives it; (i, j,
+        ...).
+    rise, tared
+        What the inclusion adds, as `sampling.solve` gives it, over `amplitudes`.
+    finer
+        What a finer mesh adds to the rise, as `sampling.refine` gives it, over `amplitudes`.
+    rise_more, tared_more
+        What finite strain adds, as `sampling.stretch` gives it, over `amplitudes`; None for a linear one.
+    errors
+        From cross-validation.
+    """
+
+    plan: Plan
+    x: Floats
+    pressure: Floats
+    moved: Floats
+    rise: Regression
+    tared: Regression
+    finer: Regression
+    rise_more: Regression | None
+    tared_more: Regression | None
+    errors: Errors
+
+    def __call__(
+        self,
+        probe: Probe,
+        slab: Slab,
+        inclusion: Inclusion | None,
+        indentation: float | None = None,
+        *,
+        force: float | None = None,
+        mechanics: str | None = None,
+        tilt: tuple[float, float] = (0.0, 0.0),
+        position: tuple[float, float] = (0.0, 0.0),
+    ) -> Emulated:
+        """Press; parameters as of `fem.press`.
+
+        Raises
+        ------
+        ValueError
+            Outside of the emulator's ranges, in one line: field, what was received, what is allowed.
+        NotModelled
+            For what it was not built for.
+        """
+        start = time.perf_counter()
+        if (indentation is None) == (force is None):
+            raise ValueError(
+                f"indentation, force: received {indentation} and {force}; allowed exactly one of the two"
+            )
+        check(self.plan, probe, slab, inclusion, mechanics or self.plan.mechanics, tilt, position)
+        depths = [self._depth(slab, some, indentation, force) for some in (inclusion, None)]
+        found = fields(self, slab, inclusion, depths[0])
+        if depths[1] != depths[0]:
+            found = {
+                **found,
+                **{k: v for k, v in fields(self, slab, None, depths[1]).items() if k.endswith("_0")},
+            }
+        contact = _grid(tuple(self.x)).copy(deep=True)
+        for name, values in found.items():
+            contact.point_data[name] = values.reshape(-1, 3) if values.ndim == 3 else values.ravel()
+        size = 4.0 if inclusion is None else inclusion.size
+        return Emulated(
+            contact,
+            depths[0],
+            depths[1],
+            1e-3 * float((found["pressure"] * found["area"]).sum()),
+            1e-3 * float((found["pressure_0"] * found["area_0"]).sum()),
+            float(min(found["pressure"].min(), found["pressure_0"].min())),
+            time.perf_counter() - start,
+            self.plan.mechanics,
+            self.errors.percentile("displacement", 95, size) if inclusion else 0.0,
+        )
+
+    def _depth(
+        self, slab: Slab, inclusion: Inclusion | None, indentation: float | None, force: float | None
+    ) -> float:
+        """The indentation asked for, or the one that takes the force, mm."""
+        low, high = self.plan.ranges.indentation_mm
+        if indentation is not None:
+            within("indentation", indentation, (low, high), "mm")
+            return float(indentation)
+        assert force is not None
+
+        def push(depth: float) -> float:
+            found = fields(self, slab, inclusion, depth)
+            return 1e-3 * float((found["pressure"] * found["area"]).sum())
+
+        ends = push(low), push(high)
+        within("force", force, ends, "N")
+        if self.plan.mechanics == "linear":
+            return force / ends[1] * high
+        return float(brentq(lambda depth: push(depth) - force, low, high, xtol=1e-9))
+
+
+def fields(emulator: Emulator, slab: Slab, inclusion: Inclusion | None, depth: float) -> dict[str, Floats]:
+    """The fields of `Emulated.surface` on the grid, (m, m) and (m, m, 3), at an indentation in mm."""
+    plan, tissue = emulator.plan, slab.modulus_kPa
+    at, level = knots(plan), lagrange(plan.levels, depth)
+    weights = np.multiply.outer(
+        lagrange(at[0], 1 / slab.thickness_mm), lagrange(at[1], float(np.log(tissue)))
+    )
+
+    def background(values: Floats, level: Floats) -> Floats:
+        return np.asarray(np.tensordot(np.multiply.outer(weights, level), values, 3))
+
+    pressure_0 = depth * tissue * background(emulator.pressure, level)
+    displacement_0 = depth * background(emulator.moved, level)
+    pressure, displacement = pressure_0, displacement_0
+    if inclusion is not None:
+        rise, tared = signal(emulator, slab, inclusion, level)
+        unit = np.tensordot(weights, emulator.pressure[:, :, 0], 2)
+        pressure = pressure_0 + rise * depth * tissue * unit
+        displacement = displacement_0 + depth * tared
+    found = {}
+    for suffix, p, u in (("", pressure, displacement), ("_0", pressure_0, displacement_0)):
+        found["displacement" + suffix], found["pressure" + suffix] = u, np.maximum(p, 0.0)
+        found["area" + suffix] = _area(emulator.x, u, plan.finite)
+    return found
+
+
+def signal(emulator: Emulator, slab: Slab, inclusion: Inclusion, level: Floats) -> tuple[Floats, Floats]:
+    """Rise (m, m) and tared displacement per mm (m, m, 3) on the grid; level: weights of the levels."""
+    plan = emulator.plan
+    x, y = inclusion.offset
+    big, small = max(abs(x), abs(y)), min(abs(x), abs(y))
+    s = float(contrast(np.array(inclusion.modulus / slab.modulus_kPa)))
+    point = np.array([inclusion.size, inclusion.depth, big, small, slab.thickness_mm, slab.modulus_kPa, s])
+    geometry = Geometry(plan.probe, slab, replace(inclusion, offset=(big, small)))
+    along, inputs = lagrange(contrast(plan.ratios), s), features(plan, point[None])
+    linear = inputs[:, :-1]
+    rise = along @ (
+        emulator.rise(linear).reshape(len(along), -1)
+        + emulator.finer(linear[:, CENTRED]).reshape(len(along), -1)
+    )
+    parts = [
+        _on_grid(
+            geometry,
+            plan.resolution,
+            emulator.x,
+            rise,
+            along @ emulator.tared(linear).reshape(len(along), -1),
+        )
+    ]
+    if emulator.rise_more is not None and emulator.tared_more is not None:
+        more = (r(inputs).reshape(len(level) - 1, -1) for r in (emulator.rise_more, emulator.tared_more))
+        parts.append(_on_grid(geometry, plan.coarse, emulator.x, *(level[1:] @ m for m in more)))
+    scales = amplitudes(point, s)
+    rise, tared = (scale * sum(part) for scale, part in zip(scales, zip(*parts, strict=True), strict=True))
+    return unfold(rise, tared, (x, y))
+
+
+def _on_grid(
+    geometry: Geometry, res: Resolution, x: Floats, rise: Floats, tared: Floats
+) -> tuple[Floats, Floats]:
+    """Carry fields from a mesh's nodes, flat, to the grid, (m, m) and (m, m, 3)."""
+    onto = resample(geometry, res, x)
+    n = onto[0].shape[1]
+    each = tared.reshape(n, n, 3).transpose(2, 0, 1)
+    return onto[0] @ rise.reshape(n, n) @ onto[1].T, np.stack(
+        [onto[0] @ u @ onto[1].T for u in each], axis=-1
+    )
+
+
+def unfold(rise: Floats, tared: Floats, offset: tuple[float, float]) -> tuple[Floats, Floats]:
+    """Fields (..., m, m) and (..., m, m, 3) of an offset x >= y >= 0 as they are at one of its eight
+    images."""
+    x, y = offset
+    if abs(y) > abs(x):
+        rise, tared = rise.swapaxes(-1, -2), tared.swapaxes(-2, -3)[..., [1, 0, 2]]
+    if x < 0:
+        rise, tared = rise[..., ::-1, :], tared[..., ::-1, :, :] * [-1.0, 1.0, 1.0]
+    if y < 0:
+        rise, tared = rise[..., ::-1], tared[..., ::-1, :] * [1.0, -1.0, 1.0]
+    return rise, tared
+
+
+def amplitudes(points: Floats, s: Floats | float) -> tuple[Floats, Floats]:
+    """What the rise and the tared displacement per mm are divided by: s d³ / z², a sphere's far field with
+    z its centre's depth, times one length; the latter also times the tissue's modulus over its thickness,
+    the pressure that a millimetre of indentation makes."""
+    size, depth, thickness, tissue = (points[..., k] for k in (0, 1, 4, 5))
+    rise = np.asarray(s * size**3 / (depth + size / 2) ** 2)
+    return rise, rise * tissue / thickness
+
+
+def features(plan: Plan, points: Floats) -> Floats:
+    """Inputs of the regressions (n, 8), each about -1 to 1: size, depth of the centre, offsets, thickness,
+    tissue, nearness of the chest wall, and s, which only what finite strain adds depends on; points (n, 7) as
+    of `Plan.points`."""
+    r = plan.ranges
+    size, depth, x, y, thickness, tissue, s = points.T
+    middle = (r.depth_mm[0] + r.size_mm[0] / 2, r.depth_mm[1] + r.size_mm[1] / 2)
+
+    def even(values: Floats, ends: tuple[float, float]) -> Floats:
+        low, high = np.log(ends)
+        return np.asarray((2 * np.log(values) - low - high) / (high - low))
+
+    columns = [even(size, r.size_mm), even(depth + size / 2, middle)]
+    columns += [2 * offset / max(r.offset_mm, 1e-9) - 1 for offset in (x, y)]
+    columns += [even(thickness, r.thickness_mm), even(tissue, r.tissue_kPa)]
+    columns.append(1.5 * np.log(2 * CLEARANCE / (thickness - size - depth)))
+    columns.append((2 * s - sum(plan.signals)) / (plan.signals[1] - plan.signals[0]))
+    return np.stack(columns, axis=1)
+
+
+def resample(geometry: Geometry, res: Resolution, x: Floats) -> tuple[Floats, Floats]:
+    """Matrices (m, n) that carry a field from a mesh's nodes to the grid, along x and along y."""
+    along = lines(geometry, res)
+    return quadratic(along[0], x), quadratic(along[1], x)
+
+
+def lagrange(nodes: Floats, at: float) -> Floats:
+    """Weights (n,) of the polynomial through n nodes."""
+    apart = nodes[:, None] - nodes + np.eye(len(nodes))
+    shares = np.where(np.eye(len(nodes), dtype=bool), 1.0, (at - nodes) / apart)
+    return np.asarray(shares.prod(axis=1))
+
+
+def _area(x: Floats, moved: Floats, finite: bool) -> Floats:
+    """Lumped area of each node (m, m), mm², on the deformed surface seen along z."""
+    lumped, slope = _weights(tuple(x))
+    if not finite:
+        return lumped
+    dx, dy = np.tensordot(slope, moved[..., :2], 1), np.einsum("jk,ikc->ijc", slope, moved[..., :2])
+    return np.asarray(lumped * ((1 + dx[..., 0]) * (1 + dy[..., 1]) - dx[..., 1] * dy[..., 0]))
+
+
+@lru_cache(maxsize=4)
+def _grid(x: tuple[float, ...]) -> pv.PolyData:
+    return surface.contact_surface(np.array(x), np.array(x))
+
+
+@lru_cache(maxsize=4)
+def _weights(x: tuple[float, ...]) -> tuple[Floats, Floats]:
+    along = np.array(x)
+    return np.outer(surface.line_weights(along), surface.line_weights(along)), recovery(along)

@@ -1,0 +1,120 @@
+"""Smooth functions of a few inputs from scattered samples: principal components, each a Gaussian process.
+
+A field (m values) of the inputs is its mean and a few modes, whose coefficients are Gaussian processes with
+a linear trend and one squared-exponential covariance for all (Rasmussen and Williams 2006, sections 2.2,
+2.7 and 5.4.1; [rasmussen2006]). Its lengths maximise the marginal likelihood, the trend and each mode's
+variance are solved for.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
+from scipy.optimize import minimize
+
+Floats = NDArray[np.float64]
+
+_MODES = 80  # at most
+_TINY = 1e-9  # share of the variance that may be left out
+_LEADING = 16  # modes that the lengths are found from
+_ENOUGH = 250  # samples that the lengths are found from
+_BOUNDS = [np.log(0.2), np.log(60.0)], [np.log(1e-9), np.log(1e-1)]  # of lengths and noise
+
+
+@dataclass(frozen=True)
+class Regression:
+    """A field as a function of q inputs; all arrays are plain numbers.
+
+    Attributes
+    ----------
+    inputs
+        (n, q) of the samples, scaled by whoever asks to about -1 ... 1.
+    lengths, noise
+        Of the covariance: (q,), and variance of the noise over that of the signal, ().
+    mean, modes
+        Of the field: (m,), (k, m).
+    trend, weights
+        Of each mode: (q + 1, k), (n, k).
+    """
+
+    inputs: Floats
+    lengths: Floats
+    noise: Floats
+    mean: Floats
+    modes: Floats
+    trend: Floats
+    weights: Floats
+
+    def __call__(self, inputs: Floats) -> Floats:
+        """Fields (p, m) at inputs (p, q)."""
+        covariance = _covariance(inputs / self.lengths, self.inputs / self.lengths)
+        return np.asarray(self.mean + (_trend(inputs) @ self.trend + covariance @ self.weights) @ self.modes)
+
+
+def _covariance(a: Floats, b: Floats) -> Floats:
+    square = (a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1) - 2 * a @ b.T
+    return np.asarray(np.exp(-0.5 * np.maximum(square, 0.0)))
+
+
+def _trend(inputs: Floats) -> Floats:
+    return np.hstack([np.ones((len(inputs), 1)), inputs])
+
+
+def principal(fields: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    """Mean (m,), modes (k, m), coefficients (n, k) of unit variance and each mode's share of the spread
+    (k,)."""
+    mean = fields.mean(axis=0)
+    left, size, modes = np.linalg.svd(fields - mean, full_matrices=False)
+    total = (size**2).sum() or 1.0  # fields that are all the same have none
+    left_out = 1 - np.cumsum(size**2) / total
+    k = min(_MODES, int(np.searchsorted(-left_out, -_TINY)) + 1, max(1, len(fields) - 8))
+    root = np.sqrt(len(fields))
+    return mean, modes[:k] * size[:k, None] / root, left[:, :k] * root, size[:k] / (size[:k].sum() or 1.0)
+
+
+def lengths(inputs: Floats, values: Floats, share: Floats) -> tuple[Floats, Floats]:
+    """Most likely lengths (q,) and noise () for coefficients (n, k) that matter by their share (k,)."""
+    inputs, values, share = inputs[:_ENOUGH], values[:_ENOUGH, :_LEADING], share[:_LEADING]
+    trend, q = _trend(inputs), inputs.shape[1]
+    free = len(inputs) - trend.shape[1]
+
+    def unlikely(logs: Floats) -> float:
+        scaled = inputs / np.exp(logs[:q])
+        covariance = _covariance(scaled, scaled) + np.exp(logs[q]) * np.eye(len(inputs))
+        try:
+            root = cholesky(covariance, lower=True)
+        except np.linalg.LinAlgError:
+            return 1e10
+        white = solve_triangular(root, np.hstack([trend, values]), lower=True)
+        basis, corner = np.linalg.qr(white[:, : q + 1])
+        rest = white[:, q + 1 :]
+        rest = rest - basis @ (basis.T @ rest)
+        spread = np.log((rest**2).sum(axis=0) / free)
+        size = 2 * np.log(np.diag(root)).sum() + 2 * np.log(np.abs(np.diag(corner))).sum()
+        return float(free * (share @ spread) / (share.sum() or 1.0) + size)
+
+    start = np.append(np.full(q, np.log(3.0)), np.log(1e-5))
+    found = minimize(unlikely, start, method="L-BFGS-B", bounds=[_BOUNDS[0]] * q + [_BOUNDS[1]])
+    return np.exp(found.x[:q]), np.exp(found.x[q])
+
+
+def regress(inputs: Floats, fields: Floats, known: tuple[Floats, Floats] | None = None) -> Regression:
+    """Fit fields (n, m) at inputs (n, q); `known`: lengths and noise, else they are found."""
+    mean, modes, values, share = principal(fields)
+    scales, noise = known or lengths(inputs, values, share)
+    scaled, trend = inputs / scales, _trend(inputs)
+    factor = cho_factor(_covariance(scaled, scaled) + noise * np.eye(len(inputs)), lower=True)
+    solved = cho_solve(factor, trend)
+    line = np.linalg.solve(trend.T @ solved, solved.T @ values)
+    return Regression(
+        inputs,
+        scales,
+        np.asarray(noise),
+        mean,
+        modes,
+        line,
+        np.asarray(cho_solve(factor, values - trend @ line)),
+    )

@@ -1,0 +1,335 @@
+"""The solves that an emulator learns from: which ones, and what is kept of each.
+
+Everything scales with the tissue's modulus, so the inclusion's enters as the contrast c with it. A sphere's
+signal goes as s = (c - 1) / (c + 1.5) (Eshelby 1957; [eshelby1957]); what is left of c after that is a
+polynomial in s through few nodes, and all of them share one factor at small strain.
+
+Finite strain costs many times more, and adds some per cent to the signal that hardly depend on the mesh: it
+is learned apart, as the difference that it makes on a coarse mesh, from fewer specimens with one modulus
+each. All press levels lie on one way down; between them and small strain, which is level 0, the answers per
+mm are a polynomial in the indentation.
+
+Contact pressures are kept as their *rise* over the tissue without inclusion, on the same mesh: next to the
+probe's edge both follow the same singularity, and so does their discretisation error. In the rise both
+cancel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import islice
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ConfigDict, Field, TypeAdapter
+from pydantic.dataclasses import dataclass
+from scipy.stats import qmc
+
+from fem import mesh
+from fem.equilibrium import State
+from fem.mesh import Geometry
+from fem.meshed import build
+from fem.model import Inclusion, Length, Poisson, Probe, Slab, check
+from fem.path import Path, path
+from fem.pressing import _contact
+from fem.solver import one_thread
+from fem.topology import Resolution
+
+Floats = NDArray[np.float64]
+
+_CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False)
+_BEYOND = 0.03  # by how much of a range the samples reach beyond it: at the ends, regression is worst
+_OFFSETS = (1, 1), (0, 0), (1, 0), (0, 0)  # which of its offsets each point of four keeps
+CLEARANCE = 4.0
+"""Least distance between inclusion and chest wall, mm."""
+
+LEAN = Resolution(arc=3, core=1, shell=3, above=3, below=1, edge=2, side=3, layer=1, backing=1)
+"""Mesh of the samples. Its rise differs from 115 thousand unknowns in a quarter by what
+`tests/bench/test_emulator.py` measures."""
+
+COARSE = Resolution(
+    arc=2, core=1, shell=2, above=2, below=1, edge=2, side=2, layer=1, backing=1, growth=(2.0, 1.6)
+)
+"""Mesh of what finite strain adds."""
+
+FINE = mesh.QUALITIES["standard"]
+"""Mesh of the background and of what makes up for the lean one; its surface is that of the answers."""
+
+
+def contrast(ratio: Floats) -> Floats:
+    """Signal s = (c - 1) / (c + 1.5) of a modulus c times the tissue's."""
+    return np.asarray((ratio - 1) / (ratio + 1.5))
+
+
+Positive = Annotated[float, Field(gt=0, le=1e7)]
+Pair = tuple[Positive, Positive]
+
+
+@dataclass(frozen=True, config=_CONFIG)
+class Ranges:
+    """What an emulator answers for: (lowest, highest)."""
+
+    size_mm: Pair = (2.0, 13.0)
+    depth_mm: Pair = (4.0, 12.0)  # to the top
+    modulus_kPa: Pair = (20.0, 120.0)
+    offset_mm: Annotated[float, Field(ge=0, le=500, description="largest offset along x and y")] = 6.0
+    indentation_mm: Pair = (0.1, 6.0)
+    tissue_kPa: Pair = (3.0, 8.0)
+    thickness_mm: Pair = (24.0, 40.0)
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if isinstance(value, tuple) and not value[0] < value[1]:
+                raise ValueError(
+                    f"ranges.{name}: received {value}; allowed is a lowest below a highest value"
+                )
+        if self.modulus_kPa[0] <= self.tissue_kPa[1]:
+            raise ValueError(
+                f"ranges.modulus_kPa: received {self.modulus_kPa[0]:g} as the lowest; "
+                f"allowed above the stiffest tissue, {self.tissue_kPa[1]:g}"
+            )
+
+
+@dataclass(frozen=True, config=_CONFIG)
+class Plan:
+    """Which sensor and which specimens to learn, and from what kind of solves."""
+
+    probe: Probe
+    width_mm: Length  # of the slab
+    poisson: Poisson = 0.49  # of the tissue
+    sides: Literal["free", "symmetric"] = "free"
+    inner_poisson: Poisson = 0.49  # of the inclusion
+    ranges: Ranges = Ranges()
+    mechanics: Literal["linear", "finite"] = "linear"
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    resolution: Resolution = LEAN
+    fine: Resolution = FINE
+    coarse: Resolution = COARSE
+
+    def __post_init__(self) -> None:
+        if self.probe.dome_radius_mm is not None:
+            raise ValueError(
+                f"probe.dome_radius_mm: received {self.probe.dome_radius_mm:g}; "
+                "allowed is none: the emulator learns flat probes only"
+            )
+
+        for name, res in (("resolution", self.resolution), ("fine", self.fine), ("coarse", self.coarse)):
+            cells = [number for part, number in vars(res).items() if part != "growth"]
+            if not all(1 <= number <= 32 for number in cells):
+                raise ValueError(f"{name}: received {res}; allowed are 1 to 32 cells along each part")
+            if not all(0.2 <= ratio <= 5 for ratio in res.growth):
+                raise ValueError(f"{name}: received {res}; allowed are cells that grow 0.2 to 5 times")
+
+    def slab(self, thickness: float, modulus: float) -> Slab:
+        return Slab(thickness, self.width_mm, modulus, self.poisson, self.sides)
+
+    @property
+    def finite(self) -> bool:
+        return self.mechanics == "finite"
+
+    @property
+    def levels(self) -> Floats:
+        """Indentations between which the answers per mm are a polynomial, mm; 0 is small strain, which needs
+        no other."""
+        return self.ranges.indentation_mm[1] * np.arange(4.0) / 3 if self.finite else np.zeros(1)
+
+    @property
+    def ratios(self) -> Floats:
+        """Moduli of the inclusion over the tissue's, evenly spaced in s."""
+        s = np.linspace(*self.signals, 3)
+        return np.asarray((1 + 1.5 * s) / (1 - s))
+
+    @property
+    def signals(self) -> tuple[float, float]:
+        """Lowest and highest s of the ranges."""
+        soft, stiff = self.ranges.tissue_kPa
+        return (
+            float(contrast(np.array(self.ranges.modulus_kPa[0] / stiff))),
+            float(contrast(np.array(self.ranges.modulus_kPa[1] / soft))),
+        )
+
+    def points(self) -> Iterator[Floats]:
+        """Scrambled Sobol sequence of (size, depth, offsets x >= y >= 0, thickness, tissue, s), those that
+        fit; s is that of the inclusion where one modulus is solved. Of four points one keeps its offsets, one
+        keeps x, and two lie under the probe's middle: symmetry makes these two and five times cheaper."""
+        r = self.ranges
+        low, high = (
+            np.array(side) for side in zip(r.size_mm, r.depth_mm, r.thickness_mm, r.tissue_kPa, strict=True)
+        )
+        beyond = _BEYOND * (high - low)
+        sobol = qmc.Sobol(7, scramble=True, rng=np.random.default_rng(self.seed))
+        number = 0
+        while True:
+            for u in sobol.random(64):
+                size, depth, thickness, tissue = low - beyond + u[:4] * (high - low + 2 * beyond)
+                x, y = np.sort(u[4:6])[::-1] * r.offset_mm * (1 + _BEYOND)
+                s = self.signals[0] + u[6] * (self.signals[1] - self.signals[0])
+                if clearance(size, depth, thickness) >= 0:
+                    keep_x, keep_y = _OFFSETS[number % len(_OFFSETS)]
+                    yield np.array([size, depth, keep_x * x, keep_y * y, thickness, tissue, s])
+                    number += 1
+
+    def inside(self, points: Floats) -> NDArray[np.bool_]:
+        """Which of the points (n, 7) lie within the ranges, (n,)."""
+        r = self.ranges
+        pairs = (r.size_mm, r.depth_mm, (0.0, r.offset_mm), (0.0, r.offset_mm), r.thickness_mm, r.tissue_kPa)
+        low, high = np.array(pairs).T
+        specimen = points[:, :6]
+        return np.asarray(((specimen >= low) & (specimen <= high)).all(axis=1))
+
+    def point(self, number: int) -> Floats:
+        return next(islice(self.points(), number, None))
+
+
+PLAN: TypeAdapter[Plan] = TypeAdapter(Plan)
+
+
+def clearance(size: float, depth: float, thickness: float) -> float:
+    """Room left between an inclusion and the chest wall, less what an emulator wants there, mm."""
+    return thickness - CLEARANCE - size - depth
+
+
+def logical_lines(res: Resolution) -> Floats:
+    """Logical coordinates of the nodes along x on the footprint, (n,)."""
+    box = res.reach * np.arange(2 * res.arc + 1) / (2 * res.arc)
+    half = np.concatenate([box, res.reach + np.arange(1, 2 * res.edge + 1) / 2])
+    return np.concatenate([-half[:0:-1], half])
+
+
+def lines(geometry: Geometry, res: Resolution) -> tuple[Floats, Floats]:
+    """Real coordinates of a mesh's nodes on the footprint along x and y, mm, each (n,)."""
+    spans, logical = mesh.box_around(geometry).surface, logical_lines(res)
+    return spans[0].lines(logical, res), spans[1].lines(logical, res)
+
+
+def geometry_at(plan: Plan, point: Floats, modulus: float) -> Geometry:
+    """Geometry of a point of the plan, with an inclusion of a modulus, kPa."""
+    size, depth, x, y, thickness, tissue = (float(v) for v in point[:6])
+    slab = plan.slab(thickness, tissue)
+    inclusion = Inclusion(size, depth, modulus, (x, y), plan.inner_poisson)
+    check(plan.probe, slab, inclusion)
+    return Geometry(plan.probe, slab, inclusion)
+
+
+def solve(plan: Plan, point: Floats) -> dict[str, Floats]:
+    """Solve one point for all moduli at small strain.
+
+    Returns
+    -------
+    `rise` (moduli, n, n): pressure over the same without inclusion, in units of the latter; `moved` (moduli,
+    n, n, 3): tared displacement per mm of indentation.
+    """
+    geometries = [geometry_at(plan, point, float(r * point[5])) for r in plan.ratios]
+    with one_thread():
+        model = build(geometries[0], plan.resolution, False)
+        bare = path(geometries[0], model, False)
+        found = [_tared(g, path(g, model, True, bare), bare, 1.0) for g in geometries]
+    return {name: np.stack([f[k] for f in found]) for k, name in enumerate(("rise", "moved"))}
+
+
+def refine(plan: Plan, point: Floats) -> dict[str, Floats]:
+    """What the finer mesh adds to the rise under the probe's middle, where symmetry makes it cheap.
+
+    Returns
+    -------
+    `rise` (moduli, n, n) as of `solve`, fine minus lean, at the lean mesh's nodes.
+    """
+    point = np.array([*point[:2], 0.0, 0.0, *point[4:]])
+    lean, fine = (solve(replace(plan, resolution=res), point) for res in (plan.resolution, plan.fine))
+    geometry = geometry_at(plan, point, 1.0)
+    nodes = [lines(geometry, res)[0] for res in (plan.resolution, plan.fine)]
+    onto = quadratic(nodes[1], nodes[0])
+    rise = np.einsum("ai,cij,bj->cab", onto, fine["rise"], onto, optimize=True)
+    return {"rise": rise - lean["rise"]}
+
+
+def stretch(plan: Plan, point: Floats) -> dict[str, Floats]:
+    """What finite strain adds on the coarse mesh, for the point's own s.
+
+    Returns
+    -------
+    `rise` (levels, k, k) and `moved` (levels, k, k, 3) as of `solve`, finite minus small strain, for the
+    levels but 0; the rise is in units of the pressure without inclusion at small strain.
+
+    Raises
+    ------
+    NotConverged, NotModelled
+        If no equilibrium is found at one of the levels.
+    """
+    ratio = (1 + 1.5 * point[6]) / (1 - point[6])
+    geometry, res = geometry_at(plan, point, float(ratio * point[5])), plan.coarse
+    with one_thread():
+        model = build(geometry, res, False)
+        bare = path(geometry, model, False)
+        small = _tared(geometry, path(geometry, model, True, bare), bare, 1.0)
+        state = bare.to(1.0)
+        unit = _fields(geometry, (state, state))[0]
+        model = build(geometry, res, True)
+        bare = path(geometry, model, False)
+        full = path(geometry, model, True, bare)
+        found = [_tared(geometry, full, bare, float(level), unit) for level in plan.levels[1:]]
+    return {name: np.stack([f[k] - small[k] for f in found]) for k, name in enumerate(("rise", "moved"))}
+
+
+def _tared(
+    geometry: Geometry, full: Path, bare: Path, level: float, unit: Floats | None = None
+) -> tuple[Floats, Floats]:
+    """Rise (n, n) over `unit` kPa / mm, by default the bare pressure itself, and tared displacement (n, n,
+    3), both per mm of the level, mm."""
+    other = bare.to(level)
+    pressure, moved, pressure_0, moved_0 = _fields(geometry, (full.to(level), other))
+    scale = pressure_0 if unit is None else unit * level
+    return (pressure - pressure_0) / scale, (moved - moved_0) / level
+
+
+def background(plan: Plan, thickness: float, tissue: float) -> dict[str, Floats]:
+    """Press on plain tissue, on the grid that answers are given on.
+
+    Returns
+    -------
+    Lines `x` (m,); `pressure` (levels, m, m) per kPa of the tissue and mm of indentation; `moved` (levels, m,
+    m, 3), displacement per mm of indentation.
+    """
+    res = plan.fine
+    # an inclusion that is left out gives every thickness the same lines
+    still = Inclusion(0.3 * plan.probe.width_mm, 0.2 * thickness, tissue)
+    geometry = Geometry(plan.probe, plan.slab(thickness, tissue), still)
+    with one_thread():
+        state = path(geometry, build(geometry, res, False), False).to(1.0)
+        found = [_fields(geometry, (state, state))[:2]]
+        if plan.finite:
+            bare = path(geometry, build(geometry, res, True), False)
+            for level in plan.levels[1:]:
+                state = bare.to(float(level))
+                found.append(tuple(f / level for f in _fields(geometry, (state, state))[:2]))
+    return {
+        "x": lines(geometry, res)[0],
+        "pressure": np.stack([f[0] for f in found]) / tissue,
+        "moved": np.stack([f[1] for f in found]),
+    }
+
+
+def _fields(geometry: Geometry, states: tuple[State, State]) -> tuple[Floats, Floats, Floats, Floats]:
+    """Pressure (n, n) and displacement (n, n, 3) on the whole footprint, of both states; kPa, mm."""
+    contact, _ = _contact(geometry, states)
+    n = round(contact.n_points**0.5)
+    data = contact.point_data
+    return (
+        np.asarray(data["pressure"], dtype=float).reshape(n, n),
+        np.asarray(data["displacement"], dtype=float).reshape(n, n, 3),
+        np.asarray(data["pressure_0"], dtype=float).reshape(n, n),
+        np.asarray(data["displacement_0"], dtype=float).reshape(n, n, 3),
+    )
+
+
+def quadratic(nodes: Floats, at: Floats) -> Floats:
+    """Weights (m, n) of the nodes of a line of quadratic elements, (n,) n odd, at places (m,)."""
+    first = 2 * np.clip(np.searchsorted(nodes[::2], at, side="right") - 1, 0, (len(nodes) - 1) // 2 - 1)
+    a, b, c = nodes[first], nodes[first + 1], nodes[first + 2]
+    weights, row = np.zeros((len(at), len(nodes))), np.arange(len(at))
+    weights[row, first] = (at - b) * (at - c) / ((a - b) * (a - c))
+    weights[row, first + 1] = (at - a) * (at - c) / ((b - a) * (b - c))
+    weights[row, first + 2] = (at - a) * (at - b) / ((c - a) * (c - b))
+    return weights

@@ -1,0 +1,203 @@
+"""Run a plan's solves in worker processes: one small file each, so that a build can be cut off and goes
+on."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from itertools import count
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fem.model import NotConverged, NotModelled
+from fem.sampling import PLAN, Plan, background, refine, solve, stretch
+
+Floats = NDArray[np.float64]
+Progress = Callable[[str, float], None]
+
+
+class NotBuilt(ValueError):
+    """An emulator that cannot be built from what there is: one line says why."""
+
+
+SHARE = 8  # samples for each pair of a fine and a lean mesh
+STRETCHED = 2  # samples for each one at finite strain, which is the same specimen as an earlier one
+_FIRST = 16  # pairs that come with one sample each
+KNOTS = (3, 3)  # Chebyshev nodes of the background along thickness and tissue: 0.1 % off between them
+
+
+def chebyshev(low: float, high: float, nodes: int) -> Floats:
+    """Chebyshev nodes (nodes,) of a range."""
+    at = np.cos(np.pi * (np.arange(nodes) + 0.5) / nodes)
+    return np.asarray(0.5 * (low + high) - 0.5 * (high - low) * at)
+
+
+def knots(plan: Plan) -> tuple[Floats, Floats]:
+    """Where the background is solved: 1/thickness, 1/mm, and the logarithm of the tissue's modulus in kPa."""
+    thick, tissue = plan.ranges.thickness_mm, plan.ranges.tissue_kPa
+    return (
+        chebyshev(1 / thick[1], 1 / thick[0], KNOTS[0]),
+        chebyshev(float(np.log(tissue[0])), float(np.log(tissue[1])), KNOTS[1]),
+    )
+
+
+def file_of(folder: Path, kind: str, number: int) -> Path:
+    """Where a solve is kept: kind "background", "sample", "pair" or "stretch"."""
+    return folder / f"{kind}-{number:05d}.npz"
+
+
+def run(
+    plan: Plan,
+    folder: Path,
+    samples: int | None,
+    seconds: float | None,
+    workers: int,
+    progress: Progress,
+) -> None:
+    """Do the solves that are not yet in the folder, until there are so many samples or the time is up.
+
+    Raises
+    ------
+    NotBuilt
+        If the folder belongs to another plan.
+    """
+    start = time.monotonic()
+    claim(plan, folder)
+    listed = None if samples is None else list(_tasks(plan, folder, samples))
+    context = multiprocessing.get_context("spawn")
+    done, running = 0, set[Future[None]]()
+    with ProcessPoolExecutor(workers, context, initializer=_alone) as pool:
+        try:
+            for kind, number in listed or _tasks(plan, folder, samples):
+                spent = time.monotonic() - start
+                if seconds is not None and spent > seconds and kind != "background":
+                    break
+                running.add(pool.submit(_work, PLAN.dump_json(plan), str(folder), kind, number))
+                if len(running) > workers:
+                    ready, running = wait(running, return_when=FIRST_COMPLETED)
+                    done += len(ready)
+                    for future in ready:
+                        future.result()
+                by_time = 0.0 if seconds is None else spent / seconds
+                by_count = 0.0 if listed is None else done / len(listed)
+                progress(f"{kind} {number + 1}", min(1.0, max(by_time, by_count)))
+            for future in running:
+                future.result()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for worker in multiprocessing.active_children():  # what they are at is left undone
+                worker.terminate()
+            raise
+
+
+def claim(plan: Plan, folder: Path) -> None:
+    """Write the plan into an empty folder, or check that it is the folder's own."""
+    folder.mkdir(parents=True, exist_ok=True)
+    text, place = PLAN.dump_json(plan, indent=1), folder / "plan.json"
+    if place.exists():
+        try:
+            same = PLAN.validate_json(place.read_bytes()) == plan
+        except ValueError:
+            same = False
+        if not same:
+            raise NotBuilt(
+                f"folder: received {folder}, which holds the samples of another plan; allowed an empty one"
+            )
+    else:
+        _write(place, text)
+
+
+def _tasks(plan: Plan, folder: Path, samples: int | None) -> Iterator[tuple[str, int]]:
+    """What is still to solve, in order; pairs are spread evenly among the samples."""
+
+    def order() -> Iterator[tuple[str, int]]:
+        pairs = 0
+        for number in range(KNOTS[0] * KNOTS[1]):
+            yield "background", number
+        for number in count() if samples is None else range(samples):
+            while pairs <= max(min(number, _FIRST - 1), number // SHARE):
+                yield "pair", pairs
+                pairs += 1
+            yield "sample", number
+            if plan.finite and number % STRETCHED == 0:
+                yield "stretch", number // STRETCHED
+
+    for kind, number in order():
+        if not file_of(folder, kind, number).exists():
+            yield kind, number
+
+
+def _alone() -> None:
+    """Ctrl-C ends a worker at once and without a word, and so does the end of its parent."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+_SOLVES = {"sample": solve, "pair": refine, "stretch": stretch}
+
+
+def _work(plan_json: bytes, folder: str, kind: str, number: int) -> None:
+    plan = PLAN.validate_json(plan_json)
+    start = time.process_time()
+    if kind == "background":
+        thick, tissue = knots(plan)
+        i, j = divmod(number, KNOTS[1])
+        found = background(plan, float(1 / thick[i]), float(np.exp(tissue[j])))
+    else:
+        point = plan.point(number)
+        try:
+            found = _SOLVES[kind](plan, point)
+        except (NotConverged, NotModelled, ArithmeticError, np.linalg.LinAlgError):
+            found = {}  # kept as a gap, so that a build that goes on does not try it again
+        found["point"] = point
+    found["seconds"] = np.array(time.process_time() - start)
+    place = file_of(Path(folder), kind, number)
+    rough = place.with_name(f".{place.name}.{os.getpid()}")
+    with open(rough, "wb") as stream:
+        kept = {name: np.asarray(value, np.float64) for name, value in found.items()}
+        np.savez(stream, **kept)  # type: ignore[arg-type]
+    os.replace(rough, place)
+
+
+def _write(place: Path, text: bytes) -> None:
+    rough = place.with_name(f".{place.name}.{os.getpid()}")
+    rough.write_bytes(text)
+    os.replace(rough, place)
+
+
+def solved(folder: Path, kind: str, first: int | None = None) -> Iterator[dict[str, Floats]]:
+    """The finished solves of a kind in their order, of the `first` ones; those that failed are left out."""
+    for place in _kept(folder, kind, first):
+        with np.load(place, allow_pickle=False) as data:
+            if len(data.files) > 2:
+                yield {name: data[name] for name in data.files} | {"number": np.array(_number(place))}
+
+
+def tally(folder: Path, kind: str, first: int | None = None) -> tuple[int, int]:
+    """How many solves of a kind were tried, and how many of them failed."""
+    return len(_kept(folder, kind, first)), len(_kept(folder, kind, first)) - len(
+        list(solved(folder, kind, first))
+    )
+
+
+def _kept(folder: Path, kind: str, first: int | None) -> list[Path]:
+    found = sorted(folder.glob(f"{kind}-*.npz"))
+    return [place for place in found if first is None or _number(place) < first]
+
+
+def _number(place: Path) -> int:
+    return int(place.stem.rpartition("-")[2])

@@ -1,0 +1,102 @@
+"""`twin emulate`: what it learns of a design, what it refuses, and that it goes on where it was cut off."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+import fem
+from fem.sampling import Plan, Ranges
+from fem.topology import Resolution
+from twin import emulate, load_design
+from twin.cli import main
+from twin.complaint import DesignError
+
+TINY = Resolution(arc=1, core=1, shell=1, above=1, below=1, edge=1, side=1, layer=1, backing=1)
+
+
+def test_the_papers_sensor_and_its_box() -> None:
+    """Of `tsis`, an emulator learns the box of the source paper's phantoms and more."""
+    plan = emulate.plan_of(load_design("tsis").pressed(mechanics="linear"), seed=4)
+    assert plan.probe == load_design("tsis").probe()
+    assert plan.mechanics == "linear" and plan.seed == 4
+    expected = Ranges()
+    for name, value in vars(plan.ranges).items():
+        assert value == pytest.approx(getattr(expected, name)), name
+
+
+def test_at_finite_strain_presses_are_half_as_deep() -> None:
+    plan = emulate.plan_of(load_design("tsis"))
+    assert plan.mechanics == "finite" and plan.ranges.indentation_mm == (0.1, 3.0)
+    assert list(plan.levels) == [0.0, 1.0, 2.0, 3.0]
+
+
+def test_designs_that_are_not_straight_are_refused() -> None:
+    design = load_design("tsis")
+    for changed, field in (
+        (design.pressed(tilt_deg=(0.0, 2.0)), "press.tilt_deg"),
+        (design.pressed(position_mm=(1.0, 0.0)), "press.position_mm"),
+        (
+            dataclasses.replace(
+                design, waveguide=dataclasses.replace(design.waveguide, dome_radius_mm=300.0)
+            ),
+            "waveguide.dome_radius_mm",
+        ),
+    ):
+        with pytest.raises(DesignError, match=field):
+            emulate.plan_of(changed)
+
+
+@pytest.mark.parametrize(
+    ("flags", "line"),
+    [
+        ([], "--out: received nothing"),
+        (["--out", "a.txt"], "out: received 'a.txt'"),
+        (["--out", "a.npz", "--workers", "0"], "--workers: received 0"),
+        (["--out", "a.npz", "--minutes", "-1"], "--minutes: received '-1'"),
+    ],
+)
+def test_mistakes_are_one_line(
+    flags: list[str],
+    line: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["emulate", "tsis", *flags]) == 2
+    error = capsys.readouterr().err
+    assert line in error and error.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_builds_and_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Too few samples end in one line and are kept; the same command with more of them writes the file."""
+
+    def small(design: object, seed: int = 0) -> Plan:
+        ranges = Ranges(
+            size_mm=(7.0, 9.0),
+            depth_mm=(5.0, 6.0),
+            offset_mm=1.0,
+            tissue_kPa=(4.5, 5.5),
+            thickness_mm=(28.0, 30.0),
+        )
+        probe = fem.Probe(20.0, (fem.Layer(6.0, 60.0),))
+        return Plan(probe, 44.0, ranges=ranges, resolution=TINY, fine=TINY, seed=seed)
+
+    monkeypatch.setattr(emulate, "plan_of", small)
+    out = tmp_path / "small.npz"
+    command = ["emulate", "tsis", "--workers", "2", "--out", str(out), "--samples"]
+    assert main([*command, "16"]) == 2
+    assert "samples: received 16 samples that were solved" in capsys.readouterr().err
+    kept = {place.name for place in (tmp_path / "small.npz.samples").iterdir()}
+    assert "sample-00015.npz" in kept and not out.exists()
+    assert main([*command, "32"]) == 0
+    said = capsys.readouterr().out
+    assert "emulator: " in said and "tared pressure, inclusions of 4 mm and more" in said
+    built = fem.load_emulator(out)
+    answer = built(built.plan.probe, fem.Slab(29.0, 44.0, 5.0), fem.Inclusion(8.0, 5.5, 60.0), 2.0)
+    assert answer.force_N > answer.force_0_N > 0

@@ -1,0 +1,312 @@
+"""The emulator of the contact field: against solves it has not seen, by symmetry and scaling, as a file."""
+
+import io
+import time
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.lib.format import write_array
+
+import fem
+from fem.emulating import build_emulator, fit
+from fem.emulator import Emulator, lagrange, resample, signal, unfold
+from fem.emulator_file import NotAnEmulator, load_emulator, save_emulator
+from fem.emulator_limits import check
+from fem.regression import Regression, regress
+from fem.sampling import Plan, Ranges, background, geometry_at, quadratic, solve
+from fem.solving import knots
+from fem.topology import Resolution
+
+PROBE = fem.Probe(20.0, (fem.Layer(6.0, 60.0),))
+RANGES = Ranges(
+    size_mm=(7.0, 9.0),
+    depth_mm=(5.0, 6.0),
+    modulus_kPa=(40.0, 80.0),
+    offset_mm=1.5,
+    indentation_mm=(0.5, 3.0),
+    tissue_kPa=(4.5, 5.5),
+    thickness_mm=(27.0, 30.0),
+)
+COARSE = Resolution(arc=1, core=1, shell=1, above=1, below=1, edge=1, side=1, layer=1, backing=1)
+FINER = Resolution(arc=2, core=1, shell=2, above=2, below=1, edge=1, side=1, layer=1, backing=1)
+PLAN = Plan(PROBE, 44.0, ranges=RANGES, resolution=COARSE, fine=FINER, seed=3)
+SLAB = fem.Slab(28.3, 44.0, 5.1)
+INCLUSION = fem.Inclusion(8.2, 5.4, 61.0, (1.1, 0.4))
+SAMPLES = 40
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("samples")
+
+
+@pytest.fixture(scope="module")
+def emulator(folder: Path) -> Emulator:
+    return build_emulator(PLAN, folder, samples=SAMPLES, workers=2)
+
+
+def grids(answer: object) -> dict[str, np.ndarray]:
+    data = answer.surface.point_data  # type: ignore[attr-defined]
+    n = round(answer.surface.n_points**0.5)  # type: ignore[attr-defined]
+    return {name: np.asarray(data[name]).reshape(n, n, *data[name].shape[1:]) for name in list(data)}
+
+
+def test_gaussian_process_finds_a_smooth_function() -> None:
+    """Error falls by orders with the samples, faster than any power: the function is analytic."""
+    rng = np.random.default_rng(0)
+    x = rng.uniform(-1, 1, (200, 2))
+    at = np.linspace(0, 1, 30)
+
+    def field(points: np.ndarray) -> np.ndarray:
+        return np.cos(points[:, :1] + at) * np.exp(-points[:, 1:] * at)
+
+    test = rng.uniform(-0.9, 0.9, (100, 2))
+    errors = [np.abs(regress(x[:n], field(x[:n]))(test) - field(test)).max() for n in (25, 50, 200)]
+    assert errors[1] < errors[0] / 3
+    assert errors[2] < 1e-4
+
+
+def test_what_never_changes_is_learned_too() -> None:
+    x = np.random.default_rng(1).uniform(-1, 1, (20, 2))
+    assert regress(x, np.full((20, 3), 4.0))(x[:5]) == pytest.approx(4.0)
+
+
+def test_quadratic_and_polynomial_weights_are_exact() -> None:
+    nodes, at = np.array([-1.0, 0.5, 1.0, 2.0, 4.0]), np.linspace(-1, 4, 11)
+    assert quadratic(nodes, at) @ (nodes**2 - nodes) == pytest.approx(at**2 - at)
+    assert lagrange(nodes, 0.3) @ nodes**4 == pytest.approx(0.3**4)
+
+
+def test_held_out_solves_are_met(emulator: Emulator) -> None:
+    """Solves of a plan with another seed, on the samples' own mesh and off-centre, are as far away as
+    cross-validation says; the gain from the finer mesh is left out on both sides."""
+    other = replace(PLAN, seed=99)
+    thick, tissue = knots(PLAN)
+    errors = []
+    for number in range(5):
+        point = other.point(number)
+        truth = solve(other, point)["rise"][1]
+        geometry = geometry_at(PLAN, point, float(PLAN.ratios[1] * point[5]))
+        assert geometry.inclusion is not None
+        coarse = replace(emulator, finer=silent(emulator.finer))
+        guess, _ = signal(coarse, geometry.slab, geometry.inclusion, np.ones(1))
+        onto = resample(geometry, PLAN.resolution, emulator.x)
+        unit = np.tensordot(
+            lagrange(tissue, np.log(point[5])),
+            np.tensordot(lagrange(thick, 1 / point[4]), emulator.pressure[:, :, 0], 1),
+            1,
+        )
+        true = onto[0] @ truth @ onto[1].T * unit
+        errors.append(100 * np.abs(guess * unit - true).max() / np.abs(true).max())
+    assert np.median(errors) < 2 * emulator.errors.percentile("pressure", 50) < 4.0
+    assert max(errors) < 2 * emulator.errors.percentile("pressure", 95)
+
+
+def silent(regression: Regression) -> Regression:
+    return replace(regression, mean=0 * regression.mean, modes=0 * regression.modes)
+
+
+def test_background_between_the_knots_is_a_solve(emulator: Emulator) -> None:
+    """Plain tissue: force within 0.1 % of a solve on the same mesh."""
+    found = background(PLAN, SLAB.thickness_mm, SLAB.modulus_kPa)
+    answer = grids(emulator(PROBE, SLAB, None, 1.0))
+    truth = SLAB.modulus_kPa * found["pressure"][0]
+    assert answer["pressure"] == pytest.approx(truth, rel=1e-3)
+    assert answer["displacement"] == pytest.approx(found["moved"][0], abs=1e-3 * np.abs(found["moved"]).max())
+    assert emulator(PROBE, SLAB, None, 1.0).error_percent == 0.0
+
+
+def test_images_of_an_offset(emulator: Emulator) -> None:
+    """The eight images of an offset under the square's symmetry give the images of one field, exactly."""
+    base = grids(emulator(PROBE, SLAB, INCLUSION, 2.0))
+    for offset in (
+        (1.1, -0.4),
+        (-1.1, 0.4),
+        (0.4, 1.1),
+        (-0.4, 1.1),
+        (0.4, -1.1),
+        (-1.1, -0.4),
+        (-0.4, -1.1),
+    ):
+        image = grids(emulator(PROBE, SLAB, replace(INCLUSION, offset=offset), 2.0))
+        pressure, displacement = unfold(base["pressure"], base["displacement"], offset)
+        assert image["pressure"] == pytest.approx(pressure, rel=1e-12)
+        assert image["displacement"] == pytest.approx(displacement, abs=1e-12)
+
+
+def test_images_agree_where_they_meet(emulator: Emulator) -> None:
+    """On a plane of symmetry the field is symmetric, although the samples lie on one side: to what
+    cross-validation says."""
+    answer = grids(emulator(PROBE, SLAB, replace(INCLUSION, offset=(1.0, 0.0)), 1.0))
+    tared = answer["pressure"] - answer["pressure_0"]
+    uneven = 100 * np.abs(tared - tared[:, ::-1]).max() / np.abs(tared).max()
+    assert uneven < emulator.errors.percentile("pressure", 95)
+
+
+def test_linear_in_the_indentation_and_inverted_by_force(emulator: Emulator) -> None:
+    one, three = (emulator(PROBE, SLAB, INCLUSION, depth) for depth in (1.0, 3.0))
+    assert grids(three)["displacement"] == pytest.approx(3 * grids(one)["displacement"], rel=1e-12)
+    assert three.force_N == pytest.approx(3 * one.force_N, rel=1e-12)
+    back = emulator(PROBE, SLAB, INCLUSION, force=2 * one.force_N)
+    assert back.indentation_mm == pytest.approx(2.0, rel=1e-9)
+    assert back.force_0_N == pytest.approx(2 * one.force_N, rel=1e-9)
+    assert back.indentation_0_mm > 2.0  # plain tissue is softer
+
+
+def test_force_is_the_integral_of_the_pressure(emulator: Emulator) -> None:
+    answer = emulator(PROBE, SLAB, INCLUSION, 2.0)
+    data = answer.surface.point_data
+    assert 1e-3 * (data["pressure"] * data["area"]).sum() == pytest.approx(answer.force_N)
+    assert data["area"].sum() == pytest.approx(PROBE.width_mm**2)
+    assert answer.min_pressure_kPa > 0
+    assert answer.path == "emulated"
+    assert 0 < answer.error_percent < 20
+
+
+REFUSED = [
+    (
+        lambda e: e(fem.Probe(20.0, (fem.Layer(6.0, 61.0),)), SLAB, INCLUSION, 1.0),
+        "probe.layers.0.modulus_kPa: ",
+    ),
+    (lambda e: e(replace(PROBE, dome_radius_mm=90.0), SLAB, INCLUSION, 1.0), "probe.dome_radius_mm: "),
+    (lambda e: e(PROBE, replace(SLAB, width_mm=50.0), INCLUSION, 1.0), "slab.width_mm: "),
+    (lambda e: e(PROBE, replace(SLAB, poisson=0.45), INCLUSION, 1.0), "slab.poisson: "),
+    (lambda e: e(PROBE, replace(SLAB, sides="symmetric"), INCLUSION, 1.0), "slab.sides: "),
+    (lambda e: e(PROBE, replace(SLAB, thickness_mm=31.0), INCLUSION, 1.0), "slab.thickness_mm: "),
+    (lambda e: e(PROBE, replace(SLAB, modulus_kPa=9.0), INCLUSION, 1.0), "slab.modulus_kPa: "),
+    (lambda e: e(PROBE, SLAB, replace(INCLUSION, size=9.5), 1.0), "inclusion.size: "),
+    (lambda e: e(PROBE, SLAB, replace(INCLUSION, depth=4.0), 1.0), "inclusion.depth: "),
+    (lambda e: e(PROBE, SLAB, replace(INCLUSION, modulus=200.0), 1.0), "inclusion.modulus: "),
+    (lambda e: e(PROBE, SLAB, replace(INCLUSION, offset=(0.0, -2.0)), 1.0), "inclusion.offset: "),
+    (lambda e: e(PROBE, SLAB, replace(INCLUSION, poisson=0.4), 1.0), "inclusion.poisson: "),
+    (lambda e: e(PROBE, SLAB, replace(INCLUSION, stretch=(1.0, 1.0, 2.0)), 1.0), "inclusion.stretch: "),
+    (lambda e: e(PROBE, SLAB, INCLUSION, 4.0), "indentation: "),
+    (lambda e: e(PROBE, SLAB, INCLUSION, float("nan")), "indentation: "),
+    (lambda e: e(PROBE, SLAB, INCLUSION, force=50.0), "force: "),
+    (lambda e: e(PROBE, SLAB, INCLUSION), "indentation, force: "),
+    (lambda e: e(PROBE, SLAB, INCLUSION, 1.0, mechanics="finite"), "mechanics: "),
+    (lambda e: e(PROBE, SLAB, INCLUSION, 1.0, tilt=(1.0, 0.0)), "tilt: "),
+    (lambda e: e(PROBE, SLAB, INCLUSION, 1.0, position=(0.0, 3.0)), "position: "),
+]
+
+
+@pytest.mark.parametrize("number", range(len(REFUSED)))
+def test_what_it_does_not_know_is_refused_in_one_line(emulator: Emulator, number: int) -> None:
+    ask, start = REFUSED[number]
+    with pytest.raises(ValueError) as caught:
+        ask(emulator)
+    assert str(caught.value).startswith(start)
+    assert "received" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_refusals_near_the_chest_wall() -> None:
+    plan = Plan(PROBE, 44.0)
+    with pytest.raises(
+        ValueError, match=r"inclusion.depth .* received 22 mm; allowed in this emulator up to 20 mm"
+    ):
+        check(
+            plan, PROBE, fem.Slab(24.0, 44.0, 5.0), fem.Inclusion(11.0, 11.0, 50.0), "linear", (0, 0), (0, 0)
+        )
+
+
+def test_answer_is_fast(emulator: Emulator) -> None:
+    times = []
+    for _ in range(20):
+        start = time.perf_counter()
+        emulator(PROBE, SLAB, INCLUSION, 2.0)
+        times.append(time.perf_counter() - start)
+    assert min(times) < 5e-3
+
+
+def test_builds_resume_and_keep_apart(emulator: Emulator, folder: Path) -> None:
+    """A second build solves nothing anew and gives the same numbers; another plan is refused the folder."""
+    before = {place.name: place.stat().st_mtime_ns for place in folder.iterdir()}
+    again = build_emulator(PLAN, folder, samples=SAMPLES, workers=1)
+    assert {place.name: place.stat().st_mtime_ns for place in folder.iterdir()} == before
+    assert np.array_equal(again.rise.weights, emulator.rise.weights)
+    with pytest.raises(ValueError, match="another plan"):
+        build_emulator(replace(PLAN, seed=4), folder, samples=SAMPLES)
+    with pytest.raises(ValueError, match="samples: received 5 samples"):
+        fit(PLAN, folder, 5)
+    with pytest.raises(ValueError, match="samples, minutes: received neither"):
+        build_emulator(PLAN, folder)
+
+
+def test_file_gives_the_same_bytes_and_answers(emulator: Emulator, tmp_path: Path) -> None:
+    places = tmp_path / "a.npz", tmp_path / "b.npz"
+    for place in places:
+        save_emulator(emulator, place)
+    assert places[0].read_bytes() == places[1].read_bytes()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.npz", "b.npz"]
+    loaded = load_emulator(places[0])
+    assert loaded.plan == emulator.plan
+    assert np.array_equal(loaded.errors.pressure, emulator.errors.pressure)
+    mine, theirs = (grids(e(PROBE, SLAB, INCLUSION, 2.0)) for e in (emulator, loaded))
+    assert all(np.array_equal(mine[name], theirs[name]) for name in mine)
+
+
+class Bomb:
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return Path.touch, (Path("exploded"),)  # type: ignore[return-value]
+
+
+def changed(place: Path, name: str, array: np.ndarray) -> Path:
+    """The file with one array replaced."""
+    out = place.with_name("changed.npz")
+    with zipfile.ZipFile(place) as old, zipfile.ZipFile(out, "w") as new:
+        for entry in old.namelist():
+            data = io.BytesIO()
+            write_array(data, array, allow_pickle=True)
+            new.writestr(entry, data.getvalue() if entry == f"{name}.npy" else old.read(entry))
+    return out
+
+
+def test_a_strangers_file_is_not_trusted(
+    emulator: Emulator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    place = tmp_path / "a.npz"
+    save_emulator(emulator, place)
+    bomb = np.array([Bomb()], dtype=object)
+    wrong = [("x", bomb), ("head", bomb), ("x", emulator.x[1:]), ("x", emulator.x[::-1].copy())]
+    wrong += [("pressure", np.full_like(emulator.pressure, np.nan)), ("rise.lengths", -emulator.rise.lengths)]
+    wrong += [("rise.modes", emulator.rise.modes[:, 1:]), ("tared.weights", emulator.tared.weights[:, 1:])]
+    wrong += [("head", np.frombuffer(b"2\n{}", np.uint8)), ("head", np.frombuffer(b"1\n{}", np.uint8))]
+    wrong += [("errors.curve", np.zeros((2, 5))), ("x", emulator.x.astype(np.float32))]
+    for name, array in wrong:
+        with pytest.raises(NotAnEmulator) as caught:
+            load_emulator(changed(place, name, array))
+        assert "\n" not in str(caught.value)
+    assert not (tmp_path / "exploded").exists()
+    for data in (b"", b"PK", place.read_bytes()[:-30], b"\x80\x04N."):
+        (tmp_path / "bad.npz").write_bytes(data)
+        with pytest.raises(NotAnEmulator):
+            load_emulator(tmp_path / "bad.npz")
+    with pytest.raises(FileNotFoundError):
+        load_emulator(tmp_path / "none.npz")
+
+
+@pytest.mark.parametrize(
+    ("ranges", "field"),
+    [
+        ({"size_mm": (5.0, 5.0)}, "size_mm"),
+        ({"modulus_kPa": (5.0, 80.0)}, "modulus_kPa"),
+        ({"depth_mm": (-1.0, 5.0)}, "depth_mm"),
+    ],
+)
+def test_senseless_ranges_are_refused(ranges: dict[str, tuple[float, float]], field: str) -> None:
+    with pytest.raises(ValueError, match=field):
+        Ranges(**ranges)  # type: ignore[arg-type]
+
+
+def test_points_fit_and_are_nested() -> None:
+    """All points keep their distance from the chest wall and lie in one octant; more of them do not change
+    the first ones."""
+    plan = Plan(PROBE, 44.0, seed=5)
+    points = np.array([plan.point(k) for k in range(0, 200, 20)])
+    assert (points[:, 0] + points[:, 1] <= points[:, 4] - 4).all()
+    assert ((points[:, 2] >= points[:, 3]) & (points[:, 3] >= 0)).all()
+    assert np.array_equal(points[3], plan.point(60))

@@ -1,0 +1,119 @@
+"""The emulator at finite strain: what it adds to small strain, and presses that it has not seen."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_fem_emulator import COARSE, INCLUSION, PLAN, PROBE, RANGES, SLAB, grids
+
+import fem
+from fem.emulating import build_emulator
+from fem.emulator import Emulator, lagrange, resample
+from fem.emulator_file import NotAnEmulator, load_emulator, save_emulator
+from fem.mesh import Geometry
+from fem.pressing import _presses
+from fem.sampling import Plan, contrast, geometry_at, solve, stretch
+from fem.solving import file_of, solved, tally
+
+FINITE = replace(PLAN, mechanics="finite", coarse=COARSE, fine=COARSE)
+SAMPLES = 32
+
+
+def deepest(depth: float) -> Plan:
+    return replace(FINITE, ranges=replace(RANGES, indentation_mm=(depth / 30, depth)))
+
+
+def presses(geometry: Geometry, levels: Sequence[float], mechanics: str) -> list[dict[str, np.ndarray]]:
+    """Fields of presses on the coarse mesh, on its grid."""
+    (found,) = _presses([geometry], levels, False, mechanics, COARSE, False, None)  # type: ignore[arg-type]
+    return [grids(press) for press in found]
+
+
+def test_what_finite_strain_adds_is_of_second_order() -> None:
+    """Per mm of indentation it is proportional to the indentation, and vanishes with it: 15 times shallower,
+    a fifteenth is added."""
+    point = FINITE.point(1)
+    deep, flat = (stretch(deepest(depth), point) for depth in (0.3, 0.02))
+    for name in ("rise", "moved"):
+        assert flat[name][1] == pytest.approx(2 * flat[name][0], abs=0.02 * np.abs(flat[name][1]).max())
+        assert deep[name][2] == pytest.approx(15 * flat[name][2], abs=0.1 * np.abs(deep[name][2]).max())
+
+
+def test_small_strain_and_what_is_added_are_the_finite_press() -> None:
+    plan = deepest(1.5)
+    point = plan.point(3)
+    ratio = (1 + 1.5 * point[6]) / (1 - point[6])
+    geometry = geometry_at(plan, point, float(ratio * point[5]))
+    found, more = solve(plan, point), stretch(plan, point)
+    along = lagrange(contrast(plan.ratios), float(point[6]))
+    (linear,) = presses(geometry, [1.0], "linear")
+    (press,) = presses(geometry, [1.0], "finite")
+    rise = (along @ found["rise"].reshape(3, -1)).reshape(more["rise"][1].shape) + more["rise"][1]
+    true = press["pressure"] - press["pressure_0"]
+    assert rise * linear["pressure_0"] == pytest.approx(true, abs=2e-3 * np.abs(true).max())
+    moved = (along @ found["moved"].reshape(3, -1)).reshape(more["moved"][1].shape) + more["moved"][1]
+    true = press["displacement"] - press["displacement_0"]
+    assert moved == pytest.approx(true, abs=2e-3 * np.abs(true).max())
+
+
+def test_solves_that_fail_are_kept_as_gaps_and_counted(tmp_path: Path) -> None:
+    for number in range(4):
+        place, values = file_of(tmp_path, "stretch", number), {} if number == 2 else {"rise": np.ones(3)}
+        np.savez(place, point=np.zeros(7), seconds=1.0, **values)
+    assert tally(tmp_path, "stretch") == (4, 1) and tally(tmp_path, "stretch", 2) == (2, 0)
+    assert [int(f["number"]) for f in solved(tmp_path, "stretch")] == [0, 1, 3]
+
+
+@pytest.fixture(scope="module")
+def emulator(tmp_path_factory: pytest.TempPathFactory) -> Emulator:
+    return build_emulator(FINITE, tmp_path_factory.mktemp("finite"), samples=SAMPLES, workers=2)
+
+
+@pytest.mark.slow
+def test_presses_between_the_levels_are_met(emulator: Emulator) -> None:
+    """Finite presses of specimens and depths that no sample has, as far away as cross-validation says."""
+    other, errors = replace(FINITE, seed=99), []
+    silent = replace(emulator.finer, mean=0 * emulator.finer.mean, modes=0 * emulator.finer.modes)
+    lean = replace(emulator, finer=silent)  # on the samples' own mesh
+    for number in (0, 4, 8):
+        point = other.point(number)
+        geometry = geometry_at(FINITE, point, float(FINITE.ratios[1] * point[5]))
+        onto = resample(geometry, COARSE, emulator.x)
+        levels = [0.7, 2.4]
+        for level, press in zip(levels, presses(geometry, levels, "finite"), strict=True):
+            answer = grids(lean(PROBE, geometry.slab, geometry.inclusion, level))
+            guess = answer["pressure"] - answer["pressure_0"]
+            true = onto[0] @ (press["pressure"] - press["pressure_0"]) @ onto[1].T
+            errors.append(100 * np.abs(guess - true).max() / np.abs(true).max())
+    print(errors, emulator.errors.pressure)
+    assert max(errors) < 2 * emulator.errors.percentile("pressure", 95) < 12.0
+
+
+@pytest.mark.slow
+def test_finite_answers_hold_together(emulator: Emulator) -> None:
+    """The force is the pressure's integral over the deformed surface, grows faster than the depth, and is
+    inverted; the file gives the same answers."""
+    answer = emulator(PROBE, SLAB, INCLUSION, 2.5)
+    data = answer.surface.point_data
+    assert answer.mechanics == "finite"
+    assert 1e-3 * (data["pressure"] * data["area"]).sum() == pytest.approx(answer.force_N)
+    assert answer.force_N > 2.5 * emulator(PROBE, SLAB, INCLUSION, 1.0).force_N
+    back = emulator(PROBE, SLAB, INCLUSION, force=answer.force_N)
+    assert back.indentation_mm == pytest.approx(2.5, rel=1e-6)
+    assert back.force_0_N == pytest.approx(answer.force_N, rel=1e-6) and back.indentation_0_mm > 2.5
+
+
+@pytest.mark.slow
+def test_finite_file(emulator: Emulator, tmp_path: Path) -> None:
+    save_emulator(emulator, tmp_path / "a.npz")
+    loaded = load_emulator(tmp_path / "a.npz")
+    mine, theirs = (grids(e(PROBE, SLAB, INCLUSION, 2.0)) for e in (emulator, loaded))
+    assert all(np.array_equal(mine[name], theirs[name]) for name in mine)
+    wrong = replace(emulator, plan=replace(emulator.plan, mechanics="linear"))
+    save_emulator(wrong, tmp_path / "b.npz")
+    with pytest.raises(NotAnEmulator):
+        load_emulator(tmp_path / "b.npz")
+    with pytest.raises(fem.NotModelled, match="mechanics: received linear"):
+        emulator(PROBE, SLAB, INCLUSION, 2.0, mechanics="linear")

@@ -1,0 +1,120 @@
+"""`twin emulate`: build the emulator of the contact field of a design's sensor."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import fem
+from twin.complaint import DesignError, shown
+from twin.design import Design
+from twin.stage import check_file
+
+if TYPE_CHECKING:
+    from fem.sampling import Plan
+
+SUFFIX = ".npz"
+
+FINITE = 0.5
+"""Deepest press learned at finite strain, as a share of the deepest that a design allows: 3 mm of 6 for
+`tsis`. Beyond, the probe's soft corners fold over inclusions under them."""
+
+
+def plan_of(design: Design, seed: int = 0) -> Plan:
+    """Return what to learn of a design: its sensor, and specimens around the design's.
+
+    Raises
+    ------
+    DesignError
+        For a design with a domed sensor, or one that is not pressed straight down on the middle.
+    """
+    for field, value in (
+        ("waveguide.dome_radius_mm", design.waveguide.dome_radius_mm),
+        ("press.tilt_deg", tuple(design.press.tilt_deg)),
+        ("press.position_mm", tuple(design.press.position_mm)),
+    ):
+        if value not in (None, (0.0, 0.0)):
+            raise DesignError(
+                field, shown(value), "none: emulators know flat sensors, straight on the middle"
+            )
+    from fem.sampling import Plan, Ranges
+
+    slab, width = design.slab(), design.waveguide.width_mm
+    ranges = Ranges(
+        size_mm=(0.08 * width, 0.52 * width),
+        depth_mm=(0.16 * width, 0.48 * width),
+        modulus_kPa=(4.0 * slab.modulus_kPa, 24.0 * slab.modulus_kPa),
+        offset_mm=0.24 * width,
+        indentation_mm=(0.1, design.max_indentation_mm * (1.0 if design.mechanics == "linear" else FINITE)),
+        tissue_kPa=(0.6 * slab.modulus_kPa, 1.6 * slab.modulus_kPa),
+        thickness_mm=(0.8 * slab.thickness_mm, 4 / 3 * slab.thickness_mm),
+    )
+    return Plan(
+        design.probe(),
+        slab.width_mm,
+        slab.poisson,
+        slab.sides,
+        ranges=ranges,
+        mechanics=design.mechanics,
+        seed=seed,
+    )
+
+
+def emulate(
+    design: Design,
+    out: str,
+    *,
+    minutes: float | None = None,
+    samples: int | None = None,
+    workers: int | None = None,
+    seed: int = 0,
+    progress: Callable[[str, float], None] | None = None,
+) -> fem.Emulator:
+    """Build the emulator of a design's sensor, write it to `out` and return it.
+
+    The solves are kept in the folder `out` + ".samples": the same call goes on with them.
+
+    Parameters
+    ----------
+    out : name of the file, ending in ``.npz``.
+    minutes, samples : when to stop solving; 30 minutes if neither is given.
+    workers : processes; all cores by default.
+    """
+    target = check_file(out, "out", SUFFIX)
+    plan = plan_of(design, seed)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if minutes is None and samples is None:
+        minutes = 30.0
+    folder = target.with_name(target.name + ".samples")
+    built = fem.build_emulator(
+        plan, folder, minutes=minutes, samples=samples, workers=workers, progress=progress
+    )
+    fem.save_emulator(built, target)
+    return built
+
+
+def summary(emulator: fem.Emulator, out: str) -> str:
+    """Return what a person wants to know of a new emulator, several lines."""
+    errors, lines = emulator.errors, []
+    low, high = emulator.plan.ranges.indentation_mm
+    lines.append(
+        f"emulator: {emulator.plan.mechanics} mechanics, presses of {low:g} to {high:g} mm, "
+        f"{len(errors.size_mm)} samples held out in turn"
+    )
+    for what, size in (("inclusions of 4 mm and more", 4.0), ("smaller ones", 0.0)):
+        for name in ("pressure", "displacement"):
+            typical, bad = (errors.percentile(name, percent, size) for percent in (50, 95))
+            lines.append(
+                f"tared {name}, {what}: largest error {typical:.2g} % of its maximum (median of held-out "
+                f"samples), {bad:.2g} % (95th percentile)"
+            )
+    for count, more, seconds, median, bad, *_ in errors.curve:
+        solves = f"{count:.0f} samples" + (f" ({more:.0f} at finite strain)" if more else "")
+        lines.append(
+            f"with {solves}, {seconds / 60:.0f} core minutes: pressure {median:.2g} % and {bad:.2g} %"
+        )
+    failed = int(errors.solves[:, 1].sum())
+    lines.append(f"solves that failed: {failed} of {int(errors.solves[:, 0].sum())}")
+    lines.append(f"file: {Path(out)}")
+    return "\n".join(lines)
