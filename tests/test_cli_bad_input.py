@@ -219,15 +219,6 @@ def test_design_files(text, words, tmp_path, monkeypatch, capfd):
         assert word in line
 
 
-def test_a_domed_guide_is_not_lit_yet(tmp_path, monkeypatch, capfd):
-    """Its mechanics can be exported; light in it is refused before any work."""
-    text = mine("width_mm = 25.0", "width_mm = 25.0\ndome_radius_mm = 120.0")
-    (tmp_path / "my.toml").write_text(text, encoding="utf-8")
-    line = run(["simulate", "my.toml", *FINE[1:]], tmp_path, monkeypatch, capfd)
-    for word in ("waveguide.dome_radius_mm", "received 120", "not modelled", "light in a domed guide"):
-        assert word in line
-
-
 def test_a_design_that_is_not_text(tmp_path, monkeypatch, capfd):
     (tmp_path / "my.toml").write_bytes(b"\xff\xfe\x00")
     assert "UTF-8" in run(["simulate", "my.toml", *FINE[1:]], tmp_path, monkeypatch, capfd)

@@ -10,7 +10,7 @@ from scenes.contact import contact_optics
 from scenes.ftir import gap_transmittance
 from scenes.slab import Slab
 from scenes.spread import spreader
-from scenes.tissue import TissueOptics, couple, tissue_optics
+from scenes.tissue import TissueOptics, couple, skewed, tissue_optics
 
 PHOTONS = 400_000
 N1, N3 = 1.4336, 1.40
@@ -265,3 +265,24 @@ def test_lobe_of_white_tissue_is_lambertian(steps: ModuleType) -> None:
     walked = steps.walk(steps.Body(steps.Medium(1.0, 0.0), 2.0, 1.0), PHOTONS, 14)
     np.testing.assert_allclose(walked.lobe, 1 / 8, atol=4.5 * walked.lobe_error.max())
     assert walked.reflectance[0] == pytest.approx(1.0, abs=2e-3)
+
+
+@pytest.mark.parametrize("cosine", [0.25, 0.5, 0.8])
+def test_light_that_enters_aslant_comes_out_ahead(steps: ModuleType, variant: str, cosine: float) -> None:
+    """Mean place of what leaves, along the way in, against the closed form from the plane albedo."""
+    import mitsuba as mi
+
+    photons = 500_000
+    random = steps.generator(photons, 11)
+    way = mi.Vector3f(float(np.sqrt(1.0 - cosine**2)), 0.0, cosine) + mi.Vector3f(0.0 * random.next_float32())
+    body = steps.Body(steps.Medium(1.0, 0.02))
+    place, _, weight, _, _ = steps.roam(body, 0.0 * mi.Point3f(way), way, random, steps.fresnel(1.0, 1.0))
+    weight = np.asarray(weight, dtype=np.float64)
+    ahead = np.asarray(place.x, dtype=np.float64)
+    mean = (weight * ahead).sum() / weight.sum()
+    error = np.std(weight * (ahead - mean)) / weight.mean() / np.sqrt(photons)
+    tissue = tissue_optics(1.0, 0.02)
+    grid = np.linspace(0.0, 1.0, tissue.lobes.shape[1])
+    expected = np.interp(cosine, grid, skewed(tissue)) / tissue.lobe(np.array(cosine))[0]
+    assert abs(mean - expected) < 3 * error + 2e-3 * expected
+    assert error < 0.02 * expected

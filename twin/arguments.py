@@ -237,7 +237,13 @@ def _add_quality_flag(parser: Parser, more: str = "") -> None:
 def _add_run_flags(parser: Parser, out: str | None = None) -> None:
     default = "" if out is None else f" (default {out})"
     parser.add_argument("--out", metavar="DIR", default=out, help="new folder for the results" + default)
-    _add_quality_flag(parser, "; reference traces paths from the camera: hours")
+    _add_quality_flag(parser, "; reference follows every ray: many minutes")
+    parser.add_argument(
+        "--noise",
+        type=number(above=0.0),
+        metavar="PERCENT",
+        help="compute light until its noise (rms of a pixel, of the mean) is there (default: the quality's)",
+    )
     _add_light_flags(parser)
 
 

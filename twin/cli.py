@@ -143,6 +143,7 @@ def _simulate(
 
         options = Options(
             quality=arguments.quality,
+            noise=arguments.noise,
             seed=arguments.seed,
             device=arguments.device,
             progress=tell,

@@ -58,6 +58,7 @@ class Options(TypedDict, total=False):
     tilt: Sequence[float] | None
     position: Sequence[float] | None
     quality: Quality
+    noise: float | None
     seed: SupportsIndex
     device: Device
     progress: Progress | None
@@ -98,6 +99,7 @@ def simulate(
     tilt: Sequence[float] | None = None,
     position: Sequence[float] | None = None,
     quality: Quality = "standard",
+    noise: float | None = None,
     seed: SupportsIndex = 0,
     device: Device = "auto",
     progress: Progress | None = None,
@@ -117,6 +119,7 @@ def simulate(
     tilt : turn of the sensor about x, then y, degrees, instead of the design's.
     position : centre of the sensor minus that of the specimen, mm, instead of the design's.
     quality : "preview", "standard" or "reference", for mechanics and light alike.
+    noise : go on with the light until its noise is at most this, rms of a pixel in per cent of the mean.
     seed : of the light's and the camera's random numbers. One level's frame does not depend on the others,
         but for the last digits of its mechanics, which are found on one way through all levels.
     device : "auto" (a CUDA GPU where there is one), "cpu" or "cuda".
@@ -132,6 +135,8 @@ def simulate(
     levels, by_force, several = presses.levels_of(design, indentation, force)
     check(design, inclusion, levels, by_force=by_force)
     seed = _seed(seed)
+    if noise is not None and not 0.0 < noise < float("inf"):
+        raise DesignError("noise", shown(noise), "a number > 0, per cent")
     pressed: Sequence[Press | Emulated] | None = None
     if mechanics == "emulator":
         known = presses.emulator_of(design, emulator)
@@ -160,7 +165,7 @@ def simulate(
             work.tell(stage, 1.0, number + share)
 
         tell(0.0)
-        frames.append(_frame(design, inclusion, press, renderer, quality, seed, level, tell))
+        frames.append(_frame(design, inclusion, press, renderer, quality, noise, seed, level, tell))
     return frames if several else frames[0]
 
 
@@ -196,6 +201,7 @@ def _frame(
     press: Press | Emulated,
     renderer: SpectralRenderer,
     quality: Quality,
+    noise: float | None,
     seed: int,
     level: float,
     tell: Callable[[float], None],
@@ -213,6 +219,7 @@ def _frame(
             press.surface,
             field=field,
             quality=quality,
+            noise=noise,
             seed=light,
             progress=lambda share: tell(before + 0.5 * share),
         )
