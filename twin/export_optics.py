@@ -137,13 +137,6 @@ def _left_out(design: Design) -> Iterator[str]:
 def _write_scene(design: Design, deformed: OpticalSurface, folder: Path) -> str:
     from scenes import Renderer
 
-    for number, led in enumerate(design.leds):
-        if led.pattern != "lambertian":
-            raise DesignError(
-                f"leds.{number}.pattern",
-                shown(led.pattern),
-                "'lambertian': Mitsuba's area lights know no other",
-            )
     renderer = Renderer(design.sensor())
     from scenes import mitsuba_files  # only now that Mitsuba has its variant
 
