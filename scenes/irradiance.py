@@ -24,28 +24,43 @@ _RIM_CELLS = 2  # 0.5 mm
 
 
 @dataclass(frozen=True)
+class Carried:
+    """Separable form of one moment of `tissue.carried` times T: sum_k rows[:, k](A_r) columns[k](cos)."""
+
+    harmonic: int  # of the azimuth: 0, or 1 or 2 with a part of the cosine and one of the sine
+    rows: Array  # (n_fraction, count), mm or mm²
+    columns: Array  # (count, n_cos)
+
+    @property
+    def layers(self) -> int:
+        return len(self.columns) * (2 if self.harmonic else 1)
+
+
+@dataclass(frozen=True)
 class AngularBasis:
     """Separable form of what enters the tissue: phi_i(cos) T(A_r, cos) = sum_k rows[i, :, k] columns[k](cos).
 
     Light arrives spread over angles, so T and the tissue's lobes phi_i cannot be taken out of the integral
     over them; with this form the integral is `count` irradiances, smooth over the surface, whatever the
-    pressure does. The same holds for what enters aslant and comes out ahead: skew(cos) T = sum_k
-    skew_rows[:, k] skew_columns[k](cos), counted for each of the two directions along the surface.
+    pressure does. The same holds for what enters aslant and comes out beside where it went in.
     """
 
     rows: Array  # (modes, n_fraction, count)
     columns: Array  # (count, n_cos)
-    skew_rows: Array  # (n_fraction, skews), mm
-    skew_columns: Array  # (skews, n_cos)
+    carried: tuple[Carried, ...] = ()
+    reach_mm: float = 0.0  # of the run before light comes out, root of half its mean square
 
     @property
     def layers(self) -> int:
-        """Maps that light is counted on: `count` plain ones, `skews` along x and as many along y."""
-        return len(self.columns) + 2 * len(self.skew_columns)
+        """Maps that light is counted on."""
+        return len(self.columns) + sum(moment.layers for moment in self.carried)
 
     def weights(self) -> Weights:
         """The columns on the device."""
-        return Weights(*(_Columns.of(columns) for columns in (self.columns, self.skew_columns)))
+        return Weights(
+            _Columns.of(self.columns),
+            tuple((moment.harmonic, _Columns.of(moment.columns)) for moment in self.carried),
+        )
 
 
 @dataclass(frozen=True)
@@ -58,8 +73,7 @@ class _Columns:
 
     @staticmethod
     def of(columns: Array) -> _Columns:
-        table = np.ascontiguousarray(columns.T, dtype=np.float32).ravel()
-        return _Columns(mi.Float(table if table.size else np.zeros(1, dtype=np.float32)), *columns.shape)
+        return _Columns(mi.Float(np.ascontiguousarray(columns.T, dtype=np.float32).ravel()), *columns.shape)
 
     def at(self, cosine: mi.Float, active: mi.Bool) -> list[mi.Float]:
         at = dr.clip(cosine, 0.0, 1.0) * (self.nodes - 1)
@@ -76,26 +90,34 @@ class Weights:
     """How much arriving light counts on each map of an `AngularBasis`."""
 
     plain: _Columns
-    skew: _Columns
+    carried: tuple[tuple[int, _Columns], ...]
 
     def at(self, cosine: mi.Float, x: mi.Float, y: mi.Float, active: mi.Bool) -> list[mi.Float]:
         """Weights on the maps of light at a cosine of incidence, whose direction has the parts x and y along
         the surface, of any length."""
-        skew = self.skew.at(cosine, active)
         unit = dr.rsqrt(dr.maximum(dr.square(x) + dr.square(y), 1e-20))
-        return [*self.plain.at(cosine, active), *(w * x * unit for w in skew), *(w * y * unit for w in skew)]
+        x, y = x * unit, y * unit
+        azimuth = {0: (mi.Float(1.0),), 1: (x, y), 2: (x * x - y * y, 2.0 * x * y)}
+        found = self.plain.at(cosine, active)
+        for harmonic, columns in self.carried:
+            here = columns.at(cosine, active)
+            found += [part * weight for part in azimuth[harmonic] for weight in here]
+        return found
 
 
 def angular_basis(
-    optics: ContactOptics, coupling: Coupling, tolerance: float = 5e-5, skew_tolerance: float = 2e-3
+    optics: ContactOptics, coupling: Coupling, tolerance: float = 5e-5, carried: float = 1e-2
 ) -> AngularBasis:
-    """Truncated singular value decompositions, largest errors at most `tolerance`; `skew_tolerance` is
-    relative to the largest skew."""
-    lobes = coupling.lobes
-    rows, columns = _separated((lobes[:, None] * optics.transmittance).reshape(-1, lobes.shape[1]), tolerance)
-    largest = max(float(np.abs(coupling.skew).max()), 1e-12)
-    skews = _separated(coupling.skew * optics.transmittance, skew_tolerance * largest)
-    return AngularBasis(rows.reshape(len(lobes), -1, len(columns)), columns, *skews)
+    """Truncated singular value decompositions, largest errors at most `tolerance`, and of the moments
+    `carried` times their largest value."""
+    lobes, through = coupling.lobes, optics.transmittance
+    rows, columns = _separated((lobes[:, None] * through).reshape(-1, lobes.shape[1]), tolerance)
+    moments = [
+        Carried(harmonic, *_separated(moment * through, carried * max(float(np.abs(moment).max()), 1e-12)))
+        for harmonic, moment in zip((1, 2, 0), coupling.carried, strict=True)
+    ]
+    reach = float(np.sqrt(2.0 * coupling.carried[1].max()))
+    return AngularBasis(rows.reshape(len(lobes), -1, len(columns)), columns, tuple(moments), reach)
 
 
 def _separated(products: Array, tolerance: float) -> tuple[Array, Array]:
@@ -113,32 +135,57 @@ def look_up(maps: Array, x: mi.Float, y: mi.Float) -> list[mi.Float]:
     return list(mi.Texture2f(mi.TensorXf(layers), wrap_mode=dr.WrapMode.Clamp).eval(mi.Point2f(x, y)))
 
 
-def transmitted(basis: AngularBasis, irradiance: Array, fraction: Array, width_mm: float) -> Array:
-    """Irradiance that enters the tissue in each mode, (n, modes, m, m) W/mm², of maps (n, layers, m, m) where
-    the real contact fraction is (m, m), on cells over a face of `width_mm`.
+def transmitted(
+    basis: AngularBasis, irradiance: Array, fraction: Array, width_mm: float, margin: int
+) -> Array:
+    """Irradiance that enters the tissue in each mode, (n, modes, m + 2 margin, m + 2 margin) W/mm².
 
-    Light that enters aslant is carried ahead to where it will come out, to first order: E_0 - div(skewed
-    light).
+    From maps (n, layers, m, m) where the real contact fraction is (m, m), on cells over a face of `width_mm`.
+    Mode 0 is carried on to where the light comes out, as `tissue.carried` tells: less div(M - div Q). What
+    goes over the rim is found in the margin beside it.
     """
-    count, skews = len(basis.columns), len(basis.skew_columns)
+    first, step = len(basis.columns), width_mm / fraction.shape[0]
     rows = by_fraction(np.moveaxis(basis.rows, 0, 1), fraction)
-    entering = np.einsum("yxik,nkyx->niyx", rows, irradiance[:, :count], optimize=True)
-    ahead = by_fraction(basis.skew_rows, fraction)
-    parts = irradiance[:, count:].reshape(len(irradiance), 2, skews, *fraction.shape)
-    carried = np.einsum("yxk,nckyx->ncyx", ahead, parts, optimize=True)
-    entering[:, 0] -= _divergence(carried, width_mm / fraction.shape[0])
-    return np.asarray(entering)
+    entering = np.einsum("yxik,nkyx->niyx", rows, irradiance[:, :first], optimize=True)
+    flow = np.zeros((2, len(irradiance), *fraction.shape))
+    for moment in basis.carried:
+        parts = 2 if moment.harmonic else 1
+        maps = irradiance[:, first : first + moment.layers]
+        maps = maps.reshape(len(maps), parts, -1, *fraction.shape)
+        first += moment.layers
+        found = np.einsum("yxk,nckyx->cnyx", by_fraction(moment.rows, fraction), maps, optimize=True)
+        if moment.harmonic == 1:
+            flow += found
+        else:
+            by_y, by_x = np.gradient(found, step, axis=(2, 3))
+            if moment.harmonic == 2:
+                flow -= np.stack([by_x[0] + by_y[1], by_x[1] - by_y[0]])
+            else:
+                flow -= np.stack([by_x[0], by_y[0]])
+    wide = np.pad(entering, ((0, 0), (0, 0), (margin, margin), (margin, margin)))
+    if basis.carried:
+        fade = np.exp(-(np.arange(margin) + 0.5) * step / basis.reach_mm)
+        wide[:, 0] -= _divergence(flow, step, fade / fade.sum())
+    return wide
 
 
-def _divergence(flow: Array, step: float) -> Array:
-    """Of flows (n, 2, m, m), x first, on cells of that step; over the rim they go out, none come in."""
-    total = np.zeros((flow.shape[0], *flow.shape[2:]))
-    for part, axis in ((flow[:, 0], 2), (flow[:, 1], 1)):
+def _divergence(flow: Array, step: float, fade: Array) -> Array:
+    """Of flows (2, n, m, m), x first, on cells of that step, with a margin (2, n, m + 2 margin, ...).
+
+    Over the rim they go out, none come in; so many cells beside it share in what goes out as `fade` tells.
+    """
+    margin, cells = len(fade), flow.shape[-1]
+    total = np.zeros((flow.shape[1], cells + 2 * margin, cells + 2 * margin))
+    inside = slice(margin, margin + cells)
+    for part, axis in ((flow[0], 2), (flow[1], 1)):
         along = np.moveaxis(part, axis, -1)
-        faces = np.empty((*along.shape[:-1], along.shape[-1] + 1))
+        faces = np.empty((*along.shape[:-1], cells + 1))
         faces[..., 1:-1] = 0.5 * (along[..., 1:] + along[..., :-1])
         faces[..., 0], faces[..., -1] = np.minimum(along[..., 0], 0.0), np.maximum(along[..., -1], 0.0)
-        total += np.moveaxis(np.diff(faces, axis=-1), -1, axis) / step
+        target = np.moveaxis(total, axis, -1)[:, inside]
+        target[..., inside] += np.diff(faces, axis=-1) / step
+        target[..., :margin] += faces[..., :1] * fade[::-1] / step
+        target[..., margin + cells :] -= faces[..., -1:] * fade / step
     return total
 
 

@@ -80,7 +80,9 @@ class Renderer:
             optics = build.optics_of(sensor)
             coupling = build.coupling_of(sensor, optics)
             _, body = tissue.body_behind(sensor.skin, sensor.tissue)
-            spreads = spread.spreader(body, coupling, sensor.guide.width_mm, transport.GRID)
+            cells = transport.GRID + 2 * transport.MARGIN
+            width = sensor.guide.width_mm * cells / transport.GRID
+            spreads = spread.spreader(body, coupling, width, cells)
             self.basis = angular_basis(optics, coupling)
         self.behind = transport.Behind(coupling, spreads)
         self.packed = Table.pack(optics, coupling)

@@ -86,6 +86,22 @@ class Slab:
         mu, weight = cosines()
         return np.asarray(self.factors(cosine) @ (2.0 * mu * weight))
 
+    def spread(self) -> Array:
+        """Plane albedo times the mean square of the way, in mean free paths, along the face from the first
+        collision to where light comes out, for light in at the N Gauss cosines; (N,)."""
+        mu, weight = cosines()
+        k2 = (1e-3 * decay_rate(self.albedo)) ** 2
+        k = np.sqrt(np.array([0.0, k2]))
+        q, rate, _ = self._rates(k)
+        falling, rising = self._amplitudes(k, (mu * q)[:, :, None] * np.diag(2.0 / weight))
+        forth, back = self._leaving(q, rate)
+        fade = np.exp(-rate * self.depth) if np.isfinite(self.depth) else np.zeros((2, mu.size))
+        out = np.einsum("kn,knc->kc", back, falling) + np.einsum("kn,knc->kc", fade * forth, rising)
+        # a source exp(-q z) with q(k) in place of exp(-z/µ): its own change is taken out
+        plane = out[0]
+        slope = np.gradient(plane, mu)
+        return np.asarray(-4.0 * ((out[1] - out[0]) / k2 + 0.5 * mu**2 * (plane + mu * slope)))
+
     def _amplitudes(self, k: Array, entering: Array) -> tuple[Array, Array]:
         """Amplitudes (n, N, c) of the modes that fall with depth and of those that rise, for c ways (N, c) or
         (n, N, c) in which light enters each "direction"."""

@@ -58,7 +58,7 @@ class Spread:
         entering : (n_led, modes, m, m)
             E_i, W/mm²: irradiance that enters the tissue, weighted with the lobes φ_i; cells [iy, ix].
         fraction : (m, m)
-            Real contact fraction.
+            Real contact fraction; not a number where there is no guide but bare skin.
         tolerance
             Of the largest residual, relative to what enters.
 
@@ -69,6 +69,9 @@ class Spread:
         """
         nodes = np.linspace(0.0, 1.0, self.held.size)
 
+        bare = np.isnan(fraction)
+        fraction = np.where(bare, 0.0, fraction)
+
         def at(table: Array) -> Array:
             return np.asarray(np.interp(fraction, nodes, table))
 
@@ -77,7 +80,8 @@ class Spread:
         for i in modes:
             source = source + at(self.feed[:, i - 1]) * entering[:, i]
         result = np.empty(entering.shape)
-        result[:, 0] = self._conjugate(source, at(self.held) - self.free, tolerance)
+        excess = np.where(bare, 0.0, at(self.held) - self.free)
+        result[:, 0] = self._conjugate(source, excess, tolerance)
         for i in modes:
             sent = entering[:, i] + at(self.back[:, i - 1]) * result[:, 0]
             for k in modes:

@@ -102,8 +102,8 @@ class Coupling:
         (n1/n3)²: radiance in the guide over that in the tissue.
     free : (modes, modes)
         W of bare skin beside the guide, in air.
-    skew : (n_cos,)
-        φ_0 times how far ahead light that enters aslant comes out, mm; see `skewed`.
+    carried : (3, n_cos)
+        φ_0 times the moments of where light comes out, by harmonics of the azimuth; see `carried`.
     """
 
     lobes: Array
@@ -111,7 +111,7 @@ class Coupling:
     gain: Array
     scale: float
     free: Array
-    skew: Array
+    carried: Array
 
 
 def tissue_optics(
@@ -183,23 +183,43 @@ def couple(optics: ContactOptics, tissue: TissueOptics, n_guide: float, n_tissue
     passed = np.einsum("m,im,jm,am->aij", moments, lobes, lobes, optics.transmittance, optimize=True)
     held = overlap - scale * passed
     free = overlap - _passed_by_bare_skin(tissue, n_tissue)
-    ahead = np.interp(np.sqrt(np.maximum(inside, 0.0)), np.linspace(0.0, 1.0, _COSINES), skewed(tissue))
-    skew = np.where(inside > 0.0, ahead, 0.0)
-    return Coupling(lobes, held, scale * _resummed(tissue.strengths, held), scale, free, skew)
+    there = np.sqrt(np.maximum(inside, 0.0))
+    grid = np.linspace(0.0, 1.0, _COSINES)
+    moments = np.stack([np.interp(there, grid, moment) for moment in carried(tissue)]) * (inside > 0.0)
+    return Coupling(lobes, held, scale * _resummed(tissue.strengths, held), scale, free, moments)
 
 
-def skewed(tissue: TissueOptics) -> Array:
-    """φ_0 times the mean run, mm, of light along its way in before it comes out, on the cosines of `lobes`.
+def carried(tissue: TissueOptics) -> Array:
+    """How light that enters aslant comes out beside the spread of Lambertian light, (3, n) on the cosines of
+    `lobes`, all times φ_0.
 
-    All collisions after the first forget where the light came from, so the run is that to the first one, over
-    what comes out: with the plane albedo R(µ) = ∫ exp(-τ/µ) P(τ) dτ/µ, P the share that comes out of the
-    depth τ, it is sinθ (R + µ dR/dµ) / (R µt'). For a diffusing half-space that is near sinθ/µt', as
-    measured by Wang & Jacques (1995; key wang1995b).
+    On a lateral scale L the light that comes out is what enters less div(M) plus div div(Q), to second order
+    in the mean free path over L: (0) M along the way in, mm, the mean run; (1) Q of cos 2φ and sin 2φ, mm²,
+    the run's square being along the way only; (2) Q in all directions alike, mm², against its Lambertian
+    mean.
+
+    All collisions after the first forget where the light came from. With the plane albedo
+    R(µ) = ∫ exp(-τ/µ) P(τ) dτ/µ, P the share that comes out of the depth τ, the mean run to the first one is
+    sinθ (R + µ R')/(R µt') (near sinθ/µt' for a diffusing half-space, as Wang & Jacques measured: 1995; key
+    wang1995b), its mean square sin²θ (2 R + 4 µ R' + µ² R'')/(R µt'²). What the light spreads from its first
+    collision on is -4 dR^/dk² at k = 0 of a source exp(-z/µ).
     """
     cosine = np.linspace(0.0, 1.0, tissue.lobes.shape[1])
+    mu, weight = cosines()
+    even = 2.0 * mu * weight
     plane = tissue.lobes[0]
-    run = np.sqrt(1.0 - cosine**2) / tissue.transport_per_mm
-    return np.asarray(run * (plane + cosine * np.gradient(plane, cosine)))
+    slope = np.gradient(plane, cosine)
+    bend = np.gradient(slope, cosine)
+    sine2 = 1.0 - cosine**2
+    run = np.sqrt(sine2) * (plane + cosine * slope)
+    square = sine2 * (2.0 * plane + 4.0 * cosine * slope + cosine**2 * bend)
+    strength = max(tissue.reflectance, _LEAST)
+    depth = np.interp(cosine, mu, tissue.slab.spread() / strength)
+    # Lambertian light as a whole is left as the kernel has it
+    round_ = square + depth
+    round_ = round_ - plane * (np.interp(mu, cosine, round_) @ even)
+    scale = 1.0 / tissue.transport_per_mm
+    return np.stack([scale * run, 0.25 * scale**2 * square, 0.25 * scale**2 * round_])
 
 
 def _passed_by_bare_skin(tissue: TissueOptics, n_tissue: float) -> Array:

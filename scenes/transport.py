@@ -22,6 +22,7 @@ from .tissue import Coupling
 Array = NDArray[np.float64]
 
 GRID = 200  # cells of the maps per side
+MARGIN = 20  # cells beside them, in which light comes out of bare skin
 _ORDERS = 12  # of re-emission at most
 _ENOUGH = 1e-4  # share of the light below which the next order is left out
 
@@ -157,5 +158,6 @@ def _first_leg(led: Led) -> int:
 
 def _spread(basis: AngularBasis, behind: Behind, ground: Ground, landed: Array, width_mm: float) -> Array:
     """Light that goes up in the tissue, (n_led, modes, GRID, GRID), from weighted irradiance."""
-    entering = transmitted(basis, landed * ground.meets, ground.fraction, width_mm)
-    return behind.spread.solve(entering, ground.fraction)
+    entering = transmitted(basis, landed * ground.meets, ground.fraction, width_mm, MARGIN)
+    fraction = np.pad(ground.fraction, MARGIN, constant_values=np.nan)
+    return behind.spread.solve(entering, fraction)[..., MARGIN:-MARGIN, MARGIN:-MARGIN]

@@ -27,7 +27,7 @@ def irradiance(one: Sensor) -> np.ndarray:
     from scenes.direct import direct
     from scenes.irradiance import AngularBasis
 
-    everything = AngularBasis(np.ones((1, 2, 1)), np.ones((1, 2)), np.zeros((2, 0)), np.zeros((0, 2)))
+    everything = AngularBasis(np.ones((1, 2, 1)), np.ones((1, 2)))
     return direct(one, everything, flat(one.guide.width_mm, 0.0))[0, 0]
 
 

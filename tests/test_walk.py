@@ -2,6 +2,7 @@
 
 import dataclasses
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from scenes.contact import contact_optics
 from scenes.ftir import gap_transmittance
 from scenes.slab import Slab
 from scenes.spread import spreader
-from scenes.tissue import TissueOptics, couple, skewed, tissue_optics
+from scenes.tissue import TissueOptics, carried, couple, tissue_optics
 
 PHOTONS = 400_000
 N1, N3 = 1.4336, 1.40
@@ -269,20 +270,32 @@ def test_lobe_of_white_tissue_is_lambertian(steps: ModuleType) -> None:
 
 @pytest.mark.parametrize("cosine", [0.25, 0.5, 0.8])
 def test_light_that_enters_aslant_comes_out_ahead(steps: ModuleType, variant: str, cosine: float) -> None:
-    """Mean place of what leaves, along the way in, against the closed form from the plane albedo."""
+    """Moments of where it leaves against the closed forms: mean, and squares along and across the way in."""
     import mitsuba as mi
 
-    photons = 500_000
-    random = steps.generator(photons, 11)
-    way = mi.Vector3f(float(np.sqrt(1.0 - cosine**2)), 0.0, cosine) + mi.Vector3f(0.0 * random.next_float32())
-    body = steps.Body(steps.Medium(1.0, 0.02))
-    place, _, weight, _, _ = steps.roam(body, 0.0 * mi.Point3f(way), way, random, steps.fresnel(1.0, 1.0))
-    weight = np.asarray(weight, dtype=np.float64)
-    ahead = np.asarray(place.x, dtype=np.float64)
-    mean = (weight * ahead).sum() / weight.sum()
-    error = np.std(weight * (ahead - mean)) / weight.mean() / np.sqrt(photons)
+    photons = 2_000_000
     tissue = tissue_optics(1.0, 0.02)
     grid = np.linspace(0.0, 1.0, tissue.lobes.shape[1])
-    expected = np.interp(cosine, grid, skewed(tissue)) / tissue.lobe(np.array(cosine))[0]
-    assert abs(mean - expected) < 3 * error + 2e-3 * expected
-    assert error < 0.02 * expected
+
+    def moments(way: Any, random: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Mean x, mean x² - y², mean x² + y² of what leaves, and their errors."""
+        body = steps.Body(steps.Medium(1.0, 0.02))
+        place, _, weight, _, _ = steps.roam(body, 0.0 * mi.Point3f(way), way, random, steps.fresnel(1.0, 1.0))
+        x, y, share = (np.asarray(v, dtype=np.float64) for v in (place.x, place.y, weight))
+        values = np.stack([x, x**2 - y**2, x**2 + y**2])
+        mean = (share * values).mean(axis=1) / share.mean()
+        spread = (share * (values - mean[:, None])).std(axis=1) / share.mean() / np.sqrt(photons)
+        return mean, spread
+
+    random = steps.generator(photons, 11)
+    zero = 0.0 * random.next_float32()
+    aslant, error = moments(mi.Vector3f(float(np.sqrt(1.0 - cosine**2)) + zero, zero, cosine + zero), random)
+    u = mi.Point2f(random.next_float32(), random.next_float32())
+    even, even_error = moments(mi.warp.square_to_cosine_hemisphere(u), random)
+    run, along, around = (
+        np.interp(cosine, grid, m) / tissue.lobe(np.array(cosine))[0] for m in carried(tissue)
+    )
+    assert abs(aslant[0] - run) < 3 * error[0] + 2e-3 * run
+    assert abs(aslant[1] - 4 * along) < 3 * error[1] + 0.02 * 4 * along
+    apart = aslant[2] - even[2] - 4 * around
+    assert abs(apart) < 3 * np.hypot(error[2], even_error[2]) + 5e-3 * even[2]
