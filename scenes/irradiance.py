@@ -11,6 +11,7 @@ from functools import lru_cache
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import scipy.fft
 from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
 
@@ -49,6 +50,7 @@ class AngularBasis:
     columns: Array  # (count, n_cos)
     carried: tuple[Carried, ...] = ()
     reach_mm: float = 0.0  # of the run before light comes out, root of half its mean square
+    spread_mm: float = 0.0  # `tissue.Coupling.spread_mm`
 
     @property
     def layers(self) -> int:
@@ -117,7 +119,9 @@ def angular_basis(
         for harmonic, moment in zip((1, 2, 0), coupling.carried, strict=True)
     ]
     reach = float(np.sqrt(2.0 * coupling.carried[1].max()))
-    return AngularBasis(rows.reshape(len(lobes), -1, len(columns)), columns, tuple(moments), reach)
+    return AngularBasis(
+        rows.reshape(len(lobes), -1, len(columns)), columns, tuple(moments), reach, coupling.spread_mm
+    )
 
 
 def _separated(products: Array, tolerance: float) -> tuple[Array, Array]:
@@ -142,7 +146,9 @@ def transmitted(
 
     From maps (n, layers, m, m) where the real contact fraction is (m, m), on cells over a face of `width_mm`.
     Mode 0 is carried on to where the light comes out, as `tissue.carried` tells: less div(M - div Q). What
-    goes over the rim is found in the margin beside it.
+    goes over the rim is found in the margin beside it. A kernel of another width s' differs from that of
+    width s by (1 + k²s²)/(1 + k²s'²), about 1 - k²(s'² - s²)/(1 + k²s²): so the part of Q that is alike in
+    all directions is smoothed before its derivatives are taken.
     """
     first, step = len(basis.columns), width_mm / fraction.shape[0]
     rows = by_fraction(np.moveaxis(basis.rows, 0, 1), fraction)
@@ -157,6 +163,8 @@ def transmitted(
         if moment.harmonic == 1:
             flow += found
         else:
+            if moment.harmonic == 0:
+                found = _smoothed(found, basis.spread_mm / step)
             by_y, by_x = np.gradient(found, step, axis=(2, 3))
             if moment.harmonic == 2:
                 flow -= np.stack([by_x[0] + by_y[1], by_x[1] - by_y[0]])
@@ -167,6 +175,14 @@ def transmitted(
         fade = np.exp(-(np.arange(margin) + 0.5) * step / basis.reach_mm)
         wide[:, 0] -= _divergence(flow, step, fade / fade.sum())
     return wide
+
+
+def _smoothed(fields: Array, reach: float) -> Array:
+    """1/(1 + k² reach²) of fields (..., m, m), reach in cells, mirrored at the rim."""
+    wave2 = (np.pi * np.arange(fields.shape[-1]) / fields.shape[-1]) ** 2
+    spectrum = scipy.fft.dctn(fields, axes=(-2, -1), workers=1)
+    spectrum /= 1.0 + reach**2 * (wave2[:, None] + wave2)
+    return np.asarray(scipy.fft.idctn(spectrum, axes=(-2, -1), workers=1))
 
 
 def _divergence(flow: Array, step: float, fade: Array) -> Array:

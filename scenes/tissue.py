@@ -64,6 +64,14 @@ class TissueOptics:
         """Total diffuse reflectance for Lambertian light, without boundary."""
         return float(self.strengths[0])
 
+    @property
+    def spread_mm(self) -> float:
+        """Half the root of the mean square distance, mm, at which Lambertian light comes out: the transform
+        falls as 1 - (spread k)² at small k."""
+        small = 1e-3 * decay_rate(self.slab.albedo)
+        none, some = self.slab.reflectance(np.array([0.0, small]))
+        return float(np.sqrt(max(none - some, 0.0) / max(none, _LEAST))) / small / self.transport_per_mm
+
     def lobe(self, cosine: Array) -> Array:
         """φ_i at cosines in the tissue: (modes, *shape of cosine)."""
         grid = np.linspace(0.0, 1.0, self.lobes.shape[1])
@@ -104,6 +112,8 @@ class Coupling:
         W of bare skin beside the guide, in air.
     carried : (3, n_cos)
         φ_0 times the moments of where light comes out, by harmonics of the azimuth; see `carried`.
+    spread_mm
+        Half the root of the mean square distance, mm, at which Lambertian light comes out.
     """
 
     lobes: Array
@@ -112,6 +122,7 @@ class Coupling:
     scale: float
     free: Array
     carried: Array
+    spread_mm: float
 
 
 def tissue_optics(
@@ -186,7 +197,8 @@ def couple(optics: ContactOptics, tissue: TissueOptics, n_guide: float, n_tissue
     there = np.sqrt(np.maximum(inside, 0.0))
     grid = np.linspace(0.0, 1.0, _COSINES)
     moments = np.stack([np.interp(there, grid, moment) for moment in carried(tissue)]) * (inside > 0.0)
-    return Coupling(lobes, held, scale * _resummed(tissue.strengths, held), scale, free, moments)
+    gain = scale * _resummed(tissue.strengths, held)
+    return Coupling(lobes, held, gain, scale, free, moments, tissue.spread_mm)
 
 
 def carried(tissue: TissueOptics) -> Array:
