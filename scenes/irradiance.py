@@ -139,27 +139,40 @@ def look_up(maps: Array, x: mi.Float, y: mi.Float) -> list[mi.Float]:
     return list(mi.Texture2f(mi.TensorXf(layers), wrap_mode=dr.WrapMode.Clamp).eval(mi.Point2f(x, y)))
 
 
-def transmitted(
-    basis: AngularBasis, irradiance: Array, fraction: Array, width_mm: float, margin: int
-) -> Array:
+@dataclass(frozen=True)
+class Entrance:
+    """An `AngularBasis` where the real contact fraction is (m, m), on cells over a face of `width_mm`."""
+
+    basis: AngularBasis
+    rows: Array  # (m, m, modes, count)
+    carried: tuple[Array, ...]  # (m, m, count) each
+    width_mm: float
+
+    @staticmethod
+    def at(basis: AngularBasis, fraction: Array, width_mm: float) -> Entrance:
+        carried = tuple(by_fraction(moment.rows, fraction) for moment in basis.carried)
+        return Entrance(basis, by_fraction(np.moveaxis(basis.rows, 0, 1), fraction), carried, width_mm)
+
+
+def transmitted(entrance: Entrance, irradiance: Array, margin: int) -> Array:
     """Irradiance that enters the tissue in each mode, (n, modes, m + 2 margin, m + 2 margin) W/mm².
 
-    From maps (n, layers, m, m) where the real contact fraction is (m, m), on cells over a face of `width_mm`.
+    From maps (n, layers, m, m) on cells over the face.
     Mode 0 is carried on to where the light comes out, as `tissue.carried` tells: less div(M - div Q). What
     goes over the rim is found in the margin beside it. A kernel of another width s' differs from that of
     width s by (1 + k²s²)/(1 + k²s'²), about 1 - k²(s'² - s²)/(1 + k²s²): so the part of Q that is alike in
     all directions is smoothed before its derivatives are taken.
     """
-    first, step = len(basis.columns), width_mm / fraction.shape[0]
-    rows = by_fraction(np.moveaxis(basis.rows, 0, 1), fraction)
-    entering = np.einsum("yxik,nkyx->niyx", rows, irradiance[:, :first], optimize=True)
-    flow = np.zeros((2, len(irradiance), *fraction.shape))
-    for moment in basis.carried:
+    basis, shape = entrance.basis, irradiance.shape[-2:]
+    first, step = len(basis.columns), entrance.width_mm / shape[0]
+    entering = np.einsum("yxik,nkyx->niyx", entrance.rows, irradiance[:, :first], optimize=True)
+    flow = np.zeros((2, len(irradiance), *shape))
+    for moment, rows in zip(basis.carried, entrance.carried, strict=True):
         parts = 2 if moment.harmonic else 1
         maps = irradiance[:, first : first + moment.layers]
-        maps = maps.reshape(len(maps), parts, -1, *fraction.shape)
+        maps = maps.reshape(len(maps), parts, -1, *shape)
         first += moment.layers
-        found = np.einsum("yxk,nckyx->cnyx", by_fraction(moment.rows, fraction), maps, optimize=True)
+        found = np.einsum("yxk,nckyx->cnyx", rows, maps, optimize=True)
         if moment.harmonic == 1:
             flow += found
         else:

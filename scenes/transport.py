@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from . import trace
 from .bsdf import Table
-from .irradiance import AngularBasis, smooth, transmitted
+from .irradiance import AngularBasis, Entrance, smooth, transmitted
 from .sensor import Led, Sensor
 from .spread import Spread
 from .tissue import Coupling
@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 GRID = 200  # cells of the maps per side
 MARGIN = 20  # cells beside them, in which light comes out of bare skin
 _ORDERS = 12  # of re-emission at most
-_ENOUGH = 1e-4  # share of the light below which the next order is left out
+_ENOUGH = 3e-3  # share of the light below which the orders to come are estimated
 
 
 @dataclass(frozen=True)
@@ -105,11 +105,12 @@ def transport(
     straight
         From `direct.direct`, (n_led, count, GRID, GRID), W/mm².
     samples
-        Light paths per LED, half of them from the LED itself.
+        Light paths per LED, more than half of them from the LED itself.
     seed
         Seed of every random choice; the result depends on nothing else, not even on the number of threads.
     """
-    n_led, width = len(sensor.leds), sensor.guide.width_mm
+    n_led = len(sensor.leds)
+    entrance = Entrance.at(basis, ground.fraction, sensor.guide.width_mm)
     flux = np.array([led.flux_W for led in sensor.leds])
     starts = np.random.Generator(np.random.Philox(seed)).integers(0, 2**32, size=(_ORDERS + 1, 4))
 
@@ -137,15 +138,21 @@ def transport(
     each = max(samples // 2, 1)
     maps, sinks, trapped, _ = walk(0, each, None)
     landed = straight + smooth(maps, GRID // trace.CELLS)
-    total = newest = _spread(basis, behind, ground, landed, width)
+    total = newest = _spread(entrance, behind, ground, landed)
+    ratio = np.zeros(n_led)
     for order in range(1, _ORDERS + 1):
-        if newest[:, 0].sum() <= _ENOUGH * total[:, 0].sum():
+        before = newest[:, 0].sum(axis=(1, 2))
+        if before.sum() <= _ENOUGH * total[:, 0].sum():
             break
-        maps, more, _, begun = walk(order, max(each >> min(order - 1, 4), 1), newest)
+        maps, more, _, begun = walk(order, max(each >> min(2 * order, 6), 2), newest)
         sinks = sinks + more
         sinks[:, 0] -= begun
-        newest = _spread(basis, behind, ground, smooth(maps, GRID // trace.CELLS), width)
+        newest = _spread(entrance, behind, ground, smooth(maps, GRID // trace.CELLS))
         total = total + newest
+        ratio = newest[:, 0].sum(axis=(1, 2)) / np.maximum(before, 1e-300)
+    # each order is like the one before by now: the rest is a geometric series
+    ratio = np.clip(ratio, 0.0, 0.9)
+    total = total + newest * (ratio / (1.0 - ratio))[:, None, None, None]
     return Light(total, sinks, trapped)
 
 
@@ -156,8 +163,8 @@ def _first_leg(led: Led) -> int:
     return trace.IN_AIR if led.coupling == "air" else trace.IN_GUIDE
 
 
-def _spread(basis: AngularBasis, behind: Behind, ground: Ground, landed: Array, width_mm: float) -> Array:
+def _spread(entrance: Entrance, behind: Behind, ground: Ground, landed: Array) -> Array:
     """Light that goes up in the tissue, (n_led, modes, GRID, GRID), from weighted irradiance."""
-    entering = transmitted(basis, landed * ground.meets, ground.fraction, width_mm, MARGIN)
+    entering = transmitted(entrance, landed * ground.meets, MARGIN)
     fraction = np.pad(ground.fraction, MARGIN, constant_values=np.nan)
     return behind.spread.solve(entering, fraction)[..., MARGIN:-MARGIN, MARGIN:-MARGIN]

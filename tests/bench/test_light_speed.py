@@ -86,8 +86,8 @@ def test_equal_noise_sooner_than_path(variant: str, coupling: str) -> None:
         noise = 100.0 * np.sqrt(np.var(runs, axis=0, ddof=1).mean()) / np.mean(runs)
         ours = seconds[name] / len(runs) * (noise / NOISE_PERCENT) ** 2
         print(
-            f"\nfull picture at {NOISE_PERCENT:g} % noise, LEDs {coupling}: {name} {ours:.2f} s (LEDs apart), "
-            f"path {theirs:.0f} s (LEDs together, from a crop), ratio {theirs / ours:.0f} (goal {GOALS[name]:.0f})"
+            f"\nfull picture at {NOISE_PERCENT:g} % noise, LEDs {coupling}: {name} {ours:.2f} s, path "
+            f"{theirs:.0f} s (from a crop), ratio {theirs / ours:.0f} (goal {GOALS[name]:.0f})"
         )
         assert theirs / ours >= GOALS[name]
 
