@@ -25,7 +25,7 @@ Pair = tuple[Regression, Regression]
 Known = tuple[tuple[Floats, Floats], ...]  # lengths and noise of both regressions
 
 _FOLDS = 10
-_FEWEST = {"sample": 30, "pair": 12, "stretch": 16}  # that a fit makes sense with
+_FEWEST = {"sample": 30, "pair": 12, "stretch": 10}  # that a fit makes sense with
 _NAMES = {"sample": "samples", "pair": "pairs of meshes", "stretch": "samples at finite strain"}
 _LEAST = 12  # samples at finite strain that the learning curve begins with
 _HELD = 3  # one in so many of the samples with both offsets is what the learning curve is measured on
