@@ -25,7 +25,7 @@ Pair = tuple[Regression, Regression]
 Known = tuple[tuple[Floats, Floats], ...]  # lengths and noise of both regressions
 
 _FOLDS = 10
-_FEWEST = {"sample": 30, "pair": 12, "stretch": 16}  # that a fit makes sense with
+_FEWEST = {"sample": 30, "pair": 12, "stretch": 10}  # that a fit makes sense with
 _NAMES = {"sample": "samples", "pair": "pairs of meshes", "stretch": "samples at finite strain"}
 _LEAST = 12  # samples at finite strain that the learning curve begins with
 _HELD = 3  # one in so many of the samples with both offsets is what the learning curve is measured on
@@ -180,7 +180,7 @@ def fit(plan: Plan, folder: str | Path, samples: int | None = None) -> Emulator:
 def _cross_validated(known: _Known, fits: _Fits, finer: Regression, solves: Floats) -> Errors:
     """Errors of samples that are left out, some at a time, from fits with the same lengths."""
     last, pairs = known.last, known.pairs
-    found, gain = np.empty((len(last.points), 4)), np.empty((len(pairs.points), 2))
+    found, gain = np.empty((len(last.points), 6)), np.empty((len(pairs.points), 3))
     for k in range(_FOLDS):
 
         def held(number: NDArray[np.int64], k: int = k) -> NDArray[np.bool_]:
@@ -200,7 +200,7 @@ def _cross_validated(known: _Known, fits: _Fits, finer: Regression, solves: Floa
             )
             gain[i] = _missed(miss, true, known.base.x)
     inside = last.typical & np.isfinite(found).all(axis=1)
-    return Errors(last.points[inside, 0], found[inside, :2], found[inside, 2:], gain, _curve(known), solves)
+    return Errors(last.points[inside, 0], found[inside, :3], found[inside, 3:], gain, _curve(known), solves)
 
 
 def _read(plan: Plan, folder: Path, kind: str, first: int | None) -> _Samples:
@@ -252,12 +252,10 @@ def _fit(known: _Known, lengths: tuple[Known, Known | None] | None) -> _Fits:
 
 def _fit_kind(known: _Samples, lengths: Known | None) -> Pair:
     """Regressions of the rise and of the tared displacement."""
-    if lengths is None:
-        # images of one sample would look like proof of no noise
-        alone = [regress(known.inputs, _flat(f)) for f in (known.rise, known.tared)]
-        lengths = (alone[0].lengths, alone[0].noise), (alone[1].lengths, alone[1].noise)
     inputs, rise, tared = _with_images(known)
-    return regress(inputs, rise, lengths[0]), regress(inputs, tared, lengths[1])
+    first, second = lengths or (None, None)
+    own = len(known.number)
+    return regress(inputs, rise, first, own), regress(inputs, tared, second, own)
 
 
 def _with_images(known: _Samples) -> tuple[Floats, Floats, Floats]:
@@ -284,10 +282,10 @@ def _with_images(known: _Samples) -> tuple[Floats, Floats, Floats]:
 
 
 def _errors(known: _Known, fits: _Fits, numbers: NDArray[np.int64]) -> Floats:
-    """Errors (n, 4) of the answers for samples of these numbers: tared pressure, then tared displacement into
+    """Errors (n, 6) of the answers for samples of these numbers: tared pressure, then tared displacement into
     the probe, as `_missed`; NaN where the same specimen failed at small strain."""
     base, samples, more, plan = known.base, known.samples, known.more, known.samples.plan
-    out = np.full((len(numbers), 4), np.nan)
+    out = np.full((len(numbers), 6), np.nan)
     for row, number in enumerate(numbers):
         at = np.flatnonzero(samples.number == number)
         if not len(at):
@@ -310,17 +308,18 @@ def _errors(known: _Known, fits: _Fits, numbers: NDArray[np.int64]) -> Floats:
                 added = (more.on_grid(j, kind, f, base.x) for f in (guess - true, true))
                 fields = [f + a for f, a in zip(fields, added, strict=True)]
             miss, true = (f * (unit if kind == "rise" else 1.0) for f in fields)
-            out[row, 2 * k : 2 * k + 2] = _missed(miss, true, base.x)
+            out[row, 3 * k : 3 * k + 3] = _missed(miss, true, base.x)
     return out
 
 
-def _missed(miss: Floats, true: Floats, x: Floats) -> tuple[float, float]:
-    """Largest error and its root mean square over the area, the worst of all cases, per cent of the true
-    field's maximum; fields (cases, m, m) on lines x."""
+def _missed(miss: Floats, true: Floats, x: Floats) -> tuple[float, float, float]:
+    """Largest error off the probe's edge, root mean square over the area, and largest error with the edge,
+    the worst of all cases, per cent of the true field's maximum; fields (cases, m, m) on lines x."""
     area = np.outer(line_weights(x), line_weights(x)) / (x[-1] - x[0]) ** 2
-    top = np.abs(true).max(axis=(1, 2))
-    largest, mean = np.abs(miss).max(axis=(1, 2)), np.sqrt((miss**2 * area).sum(axis=(1, 2)))
-    return float(100 * (largest / top).max()), float(100 * (mean / top).max())
+    top, size = np.abs(true).max(axis=(1, 2)), np.abs(miss)
+    mean = np.sqrt((miss**2 * area).sum(axis=(1, 2)))
+    inner = size[:, 1:-1, 1:-1].max(axis=(1, 2))
+    return tuple(float(100 * (part / top).max()) for part in (inner, mean, size.max(axis=(1, 2))))  # type: ignore[return-value]
 
 
 def _curve(known: _Known) -> Floats:
@@ -344,5 +343,5 @@ def _curve(known: _Known) -> Floats:
         found = _errors(known, _fit(some, None), test)
         found = found[np.isfinite(found).all(axis=1)]
         spent = sum(float(part.seconds.sum()) for part in parts if part is not None)
-        rows.append([*solves, spent, *(np.percentile(found[:, k], p) for k in (0, 1) for p in (50, 95))])
-    return np.array(rows).reshape(-1, 7)
+        rows.append([*solves, spent, *(np.percentile(found[:, k], p) for k in (0, 1, 2) for p in (50, 95))])
+    return np.array(rows).reshape(-1, 9)

@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fem.emulator import Emulator, Errors
-from fem.regression import Regression
+from fem.regression import Regression, groups
 from fem.sampling import PLAN, Plan, logical_lines
 from fem.solving import KNOTS
 
 Floats = NDArray[np.float64]
 
-_FORMAT = 2
+_FORMAT = 3
 _LARGEST = 512 * 2**20  # bytes of all arrays
 _REGRESSIONS = ("rise", "tared", "finer")
 _MORE = ("rise_more", "tared_more")  # that finite strain has besides
@@ -125,10 +125,10 @@ def _checked(arrays: dict[str, NDArray[Any]]) -> Emulator:
     points, pairs, rows = (len(arrays[f"errors.{k}"]) for k in ("size_mm", "finer", "curve"))
     shapes |= {
         "errors.size_mm": (points,),
-        "errors.pressure": (points, 2),
-        "errors.displacement": (points, 2),
+        "errors.pressure": (points, 3),
+        "errors.displacement": (points, 3),
     }
-    shapes |= {"errors.finer": (pairs, 2), "errors.curve": (rows, 7), "errors.solves": (3, 2)}
+    shapes |= {"errors.finer": (pairs, 3), "errors.curve": (rows, 9), "errors.solves": (3, 2)}
     for name, shape in shapes.items():
         if arrays[name].shape != shape:
             raise ValueError(f"{name} has shape {arrays[name].shape}, not {shape}")
@@ -141,8 +141,8 @@ def _shapes_of(arrays: dict[str, NDArray[Any]], name: str, q: int, values: int) 
         raise ValueError(f"{name}: lengths and noise are not positive")
     shapes = {
         "inputs": (samples, q),
-        "lengths": (q,),
-        "noise": (),
+        "lengths": (len(groups(modes)), q),
+        "noise": (len(groups(modes)),),
         "mean": (values,),
         "modes": (modes, values),
     }

@@ -1,9 +1,9 @@
 """Smooth functions of a few inputs from scattered samples: principal components, each a Gaussian process.
 
 A field (m values) of the inputs is its mean and a few modes, whose coefficients are Gaussian processes with
-a linear trend and one squared-exponential covariance for all (Rasmussen and Williams 2006, sections 2.2,
-2.7 and 5.4.1; [rasmussen2006]). Its lengths maximise the marginal likelihood, the trend and each mode's
-variance are solved for.
+a linear trend and squared-exponential covariances (Rasmussen and Williams 2006, sections 2.2, 2.7 and 5.4.1;
+[rasmussen2006]). Leading modes have lengths of their own, the others share some; they maximise the marginal
+likelihood, the trend and each mode's variance are solved for.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ Floats = NDArray[np.float64]
 
 _MODES = 80  # at most
 _TINY = 1e-9  # share of the variance that may be left out
-_LEADING = 16  # modes that the lengths are found from
+_GROUPS = (0, 1, 2, 4, 8, 16)  # first modes of groups that share their lengths
+_LEADING = 16  # modes of a group that the lengths are found from
 _ENOUGH = 250  # samples that the lengths are found from
 _BOUNDS = [np.log(0.2), np.log(60.0)], [np.log(1e-9), np.log(1e-1)]  # of lengths and noise
 
@@ -33,7 +34,8 @@ class Regression:
     inputs
         (n, q) of the samples, scaled by whoever asks to about -1 ... 1.
     lengths, noise
-        Of the covariance: (q,), and variance of the noise over that of the signal, ().
+        Of the covariance of each group of modes, which begin at modes `_GROUPS`: (g, q), and variance of the
+        noise over that of the signal, (g,).
     mean, modes
         Of the field: (m,), (k, m).
     trend, weights
@@ -50,8 +52,16 @@ class Regression:
 
     def __call__(self, inputs: Floats) -> Floats:
         """Fields (p, m) at inputs (p, q)."""
-        covariance = _covariance(inputs / self.lengths, self.inputs / self.lengths)
-        return np.asarray(self.mean + (_trend(inputs) @ self.trend + covariance @ self.weights) @ self.modes)
+        found = _trend(inputs) @ self.trend
+        for group, scales in zip(groups(len(self.modes)), self.lengths, strict=True):
+            found[:, group] += _covariance(inputs / scales, self.inputs / scales) @ self.weights[:, group]
+        return np.asarray(self.mean + found @ self.modes)
+
+
+def groups(modes: int) -> list[slice]:
+    """The modes of each group that shares its lengths."""
+    starts = [start for start in _GROUPS if start < modes]
+    return [slice(a, b) for a, b in zip(starts, [*starts[1:], modes], strict=True)]
 
 
 def _covariance(a: Floats, b: Floats) -> Floats:
@@ -101,20 +111,34 @@ def lengths(inputs: Floats, values: Floats, share: Floats) -> tuple[Floats, Floa
     return np.exp(found.x[:q]), np.exp(found.x[q])
 
 
-def regress(inputs: Floats, fields: Floats, known: tuple[Floats, Floats] | None = None) -> Regression:
-    """Fit fields (n, m) at inputs (n, q); `known`: lengths and noise, else they are found."""
+def regress(
+    inputs: Floats,
+    fields: Floats,
+    known: tuple[Floats, Floats] | None = None,
+    own: int | None = None,
+) -> Regression:
+    """Fit fields (n, m) at inputs (n, q).
+
+    Parameters
+    ----------
+    known
+        Lengths and noise; else they are found.
+    own
+        From how many of the first samples they are found, all by default. Images of samples, which repeat the
+        numbers of others, would look like proof of no noise.
+    """
     mean, modes, values, share = principal(fields)
-    scales, noise = known or lengths(inputs, values, share)
-    scaled, trend = inputs / scales, _trend(inputs)
-    factor = cho_factor(_covariance(scaled, scaled) + noise * np.eye(len(inputs)), lower=True)
-    solved = cho_solve(factor, trend)
-    line = np.linalg.solve(trend.T @ solved, solved.T @ values)
-    return Regression(
-        inputs,
-        scales,
-        np.asarray(noise),
-        mean,
-        modes,
-        line,
-        np.asarray(cho_solve(factor, values - trend @ line)),
-    )
+    trend, parts = _trend(inputs), groups(len(modes))
+    if known is None:
+        found = [lengths(inputs[:own], values[:own, part], share[part]) for part in parts]
+        scales, noise = np.stack([f[0] for f in found]), np.array([f[1] for f in found])
+    else:  # fewer modes may have come out
+        scales, noise = (values[: len(parts)] for values in known)
+    line, weights = np.empty((trend.shape[1], len(modes))), np.empty(values.shape)
+    for part, scale, some in zip(parts, scales, noise, strict=True):
+        scaled = inputs / scale
+        factor = cho_factor(_covariance(scaled, scaled) + some * np.eye(len(inputs)), lower=True)
+        solved = cho_solve(factor, trend)
+        line[:, part] = np.linalg.solve(trend.T @ solved, solved.T @ values[:, part])
+        weights[:, part] = cho_solve(factor, values[:, part] - trend @ line[:, part])
+    return Regression(inputs, scales, noise, mean, modes, line, weights)

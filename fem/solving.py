@@ -28,7 +28,7 @@ class NotBuilt(ValueError):
 
 
 SHARE = 8  # samples for each pair of a fine and a lean mesh
-STRETCHED = 2  # samples for each one at finite strain, which is the same specimen as an earlier one
+STRETCHED = 3  # samples for each one at finite strain, which is the same specimen as an earlier one
 _FIRST = 16  # pairs that come with one sample each
 KNOTS = (3, 3)  # Chebyshev nodes of the background along thickness and tissue: 0.1 % off between them
 

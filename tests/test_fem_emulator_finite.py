@@ -10,7 +10,7 @@ from test_fem_emulator import COARSE, INCLUSION, PLAN, PROBE, RANGES, SLAB, grid
 
 import fem
 from fem.emulating import build_emulator
-from fem.emulator import Emulator, lagrange, resample
+from fem.emulator import Emulator, lagrange, resample, signal
 from fem.emulator_file import NotAnEmulator, load_emulator, save_emulator
 from fem.mesh import Geometry
 from fem.pressing import _presses
@@ -18,7 +18,7 @@ from fem.sampling import Plan, contrast, geometry_at, solve, stretch
 from fem.solving import file_of, solved, tally
 
 FINITE = replace(PLAN, mechanics="finite", coarse=COARSE, fine=COARSE)
-SAMPLES = 32
+SAMPLES = 40
 
 
 def deepest(depth: float) -> Plan:
@@ -72,6 +72,7 @@ def emulator(tmp_path_factory: pytest.TempPathFactory) -> Emulator:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1200)
 def test_presses_between_the_levels_are_met(emulator: Emulator) -> None:
     """Finite presses of specimens and depths that no sample has, as far away as cross-validation says."""
     other, errors = replace(FINITE, seed=99), []
@@ -80,18 +81,20 @@ def test_presses_between_the_levels_are_met(emulator: Emulator) -> None:
     for number in (0, 4, 8):
         point = other.point(number)
         geometry = geometry_at(FINITE, point, float(FINITE.ratios[1] * point[5]))
+        assert geometry.inclusion is not None
         onto = resample(geometry, COARSE, emulator.x)
-        levels = [0.7, 2.4]
-        for level, press in zip(levels, presses(geometry, levels, "finite"), strict=True):
-            answer = grids(lean(PROBE, geometry.slab, geometry.inclusion, level))
-            guess = answer["pressure"] - answer["pressure_0"]
-            true = onto[0] @ (press["pressure"] - press["pressure_0"]) @ onto[1].T
-            errors.append(100 * np.abs(guess - true).max() / np.abs(true).max())
-    print(errors, emulator.errors.pressure)
+        (linear,) = presses(geometry, [1.0], "linear")
+        for level, press in zip((0.7, 2.4), presses(geometry, [0.7, 2.4], "finite"), strict=True):
+            guess = signal(lean, geometry.slab, geometry.inclusion, lagrange(FINITE.levels, level))[0]
+            # so few cells cannot interpolate the singular pressure itself, but what it rises by
+            rise = (press["pressure"] - press["pressure_0"]) / (level * linear["pressure_0"])
+            true = onto[0] @ rise @ onto[1].T
+            errors.append(100 * np.abs(guess - true)[1:-1, 1:-1].max() / np.abs(true).max())
     assert max(errors) < 2 * emulator.errors.percentile("pressure", 95) < 12.0
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1200)
 def test_finite_answers_hold_together(emulator: Emulator) -> None:
     """The force is the pressure's integral over the deformed surface, grows faster than the depth, and is
     inverted; the file gives the same answers."""
@@ -106,6 +109,7 @@ def test_finite_answers_hold_together(emulator: Emulator) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1200)
 def test_finite_file(emulator: Emulator, tmp_path: Path) -> None:
     save_emulator(emulator, tmp_path / "a.npz")
     loaded = load_emulator(tmp_path / "a.npz")

@@ -31,8 +31,8 @@ def constant(values: np.ndarray, inputs: int) -> Regression:
     flat = values.ravel()
     return Regression(
         inputs=np.zeros((1, inputs)),
-        lengths=np.ones(inputs),
-        noise=np.array(1e-6),
+        lengths=np.ones((1, inputs)),
+        noise=np.full(1, 1e-6),
         mean=flat,
         modes=np.zeros((1, len(flat))),
         trend=np.zeros((inputs + 1, 1)),
@@ -57,10 +57,10 @@ def invented(mechanics: str = "linear") -> Emulator:
         more = [constant(np.stack([0.1 * k * b for k in (1, 2, 3)]), 8) for b in (bump, into)]
     errors = Errors(
         np.full(20, 8.0),
-        np.ones((20, 2)),
-        np.full((20, 2), 1.5),
-        np.ones((16, 2)),
-        np.zeros((0, 7)),
+        np.ones((20, 3)),
+        np.full((20, 3), 1.5),
+        np.ones((16, 3)),
+        np.zeros((0, 9)),
         np.zeros((3, 2)),
     )
     known = [np.stack([b] * 3) for b in (bump, into)]

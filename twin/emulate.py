@@ -106,8 +106,8 @@ def summary(emulator: fem.Emulator, out: str) -> str:
         for name in ("pressure", "displacement"):
             typical, bad = (errors.percentile(name, percent, size) for percent in (50, 95))
             lines.append(
-                f"tared {name}, {what}: largest error {typical:.2g} % of its maximum (median of held-out "
-                f"samples), {bad:.2g} % (95th percentile)"
+                f"tared {name}, {what}: largest error off the edge {typical:.2g} % of its maximum (median of "
+                f"held-out samples), {bad:.2g} % (95th percentile)"
             )
     for count, more, seconds, median, bad, *_ in errors.curve:
         solves = f"{count:.0f} samples" + (f" ({more:.0f} at finite strain)" if more else "")

@@ -19,8 +19,8 @@ from twin.emulate import plan_of
 
 MINUTES, WORKERS = 30.0, 2
 MEDIAN_PERCENT, HIGH_PERCENT = 1.0, 4.0
-"""Goal for the largest error of the tared pressure, over its maximum, of held-out inclusions of 4 mm and
-more."""
+"""Goal for the largest error of the tared pressure off the probe's edge, over its maximum, of held-out
+inclusions of 4 mm and more."""
 FAILED_PERCENT = 2.0  # of the solves that may be missing
 
 UNSEEN = {"standard": 4, "preview": 2}
@@ -38,7 +38,7 @@ def test_emulator_after_half_an_hour(tmp_path: Path) -> None:
     assert np.array_equal(again.rise.weights, built.rise.weights)
     for quality, count in UNSEEN.items():
         missed = np.array([missed_by(built, point, quality) for point in unseen(built, quality, count)])
-        print(f"tared pressure against presses of {quality} quality, worst of 1, 2, 3 mm: largest, rms, %:")
+        print(f"tared pressure against presses of {quality} quality, worst of 1, 2, 3 mm, as above, %:")
         print(np.round(missed, 2).tolist())
         assert missed[:, 1].max() <= MEDIAN_PERCENT
     errors = built.errors
@@ -51,16 +51,18 @@ def test_emulator_after_half_an_hour(tmp_path: Path) -> None:
 def show(built: Emulator) -> None:
     errors = built.errors
     thick = int((errors.size_mm >= 4).sum())
-    print(f"\n{len(errors.size_mm)} samples left out in turn, {thick} of 4 mm and more: largest error, %:")
+    print(f"\n{len(errors.size_mm)} samples left out in turn, {thick} of 4 mm and more; error, %:")
     for name in ("pressure", "displacement"):
         for size, what in ((4.0, "d >= 4 mm"), (0.0, "d < 4 mm")):
-            found = [errors.percentile(name, percent, size, kind) for kind in (0, 1) for percent in (50, 95)]
+            found = [errors.percentile(name, p, size, kind) for kind in (0, 1, 2) for p in (50, 95)]
             print(
-                f"  tared {name}, {what}: median {found[0]:.2f}, 95th percentile {found[1]:.2f}; "
-                f"root mean square over the area {found[2]:.2f}, {found[3]:.2f}"
+                f"  tared {name}, {what}: largest off the edge, median {found[0]:.2f}, 95th percentile "
+                f"{found[1]:.2f}; root mean square over the area {found[2]:.2f}, {found[3]:.2f}; "
+                f"largest with the edge {found[4]:.2f}, {found[5]:.2f}"
             )
     print("learning curve, a common third held out, d >= 4 mm: samples at small and at finite strain,")
-    print("core minutes, largest error: median, 95th percentile; root mean square: the same")
+    print("core minutes; median, 95th percentile of the largest error off the edge, of the root mean square,")
+    print("and of the largest error with the edge:")
     for count, more, seconds, *found in errors.curve:
         print(f"  {count:4.0f} {more:4.0f} {seconds / 60:5.1f} ", *(f"{value:5.2f}" for value in found))
     print(f"failed solves: {errors.solves[:, 1].sum():.0f} of {errors.solves[:, 0].sum():.0f}")
@@ -91,8 +93,8 @@ def unseen(built: Emulator, quality: str, count: int) -> list[np.ndarray]:
 
 
 def missed_by(built: Emulator, point: np.ndarray, quality: str) -> list[float]:
-    """Error of the tared pressure, per cent of its maximum, the worst of three levels: largest, root mean
-    square."""
+    """Error of the tared pressure, per cent of its maximum, the worst of three levels: largest off the
+    edge, root mean square, largest."""
     plan = built.plan
     geometry = geometry_at(plan, point, float((1 + 1.5 * point[6]) / (1 - point[6]) * point[5]))
     onto = resample(geometry, mesh.QUALITIES[quality], built.x)
@@ -111,7 +113,8 @@ def missed_by(built: Emulator, point: np.ndarray, quality: str) -> list[float]:
     for level, press in zip(levels, presses, strict=True):
         true = onto[0] @ _tared(press) @ onto[1].T
         miss = _tared(built(plan.probe, geometry.slab, geometry.inclusion, level)) - true
-        out.append([np.abs(miss).max(), np.sqrt((miss**2 * area).sum())] / np.abs(true).max())
+        inner = np.abs(miss[1:-1, 1:-1]).max()
+        out.append([inner, np.sqrt((miss**2 * area).sum()), np.abs(miss).max()] / np.abs(true).max())
     return [float(value) for value in 100 * np.max(out, axis=0)]
 
 
