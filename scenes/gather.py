@@ -65,7 +65,7 @@ def look(scene: mi.Scene, sensor: Sensor, table: Table, coupling: Coupling, rays
     points, windows = [], []
     start = mi.Point3f(*origin) + _STEP_MM / direction.z * direction
     for _ in range(_SIGHTS):
-        si = _meet(scene, named["contact"], start, direction)
+        si = meet(scene, named["contact"], start, direction)
         seen = si.is_valid() & (si.shape == named["contact"])
         _add_lamps(lamps, si, gain, sensor, named, patterns)
         windows.append(gain)
@@ -96,7 +96,7 @@ def look(scene: mi.Scene, sensor: Sensor, table: Table, coupling: Coupling, rays
     return Sight(position.astype(np.float32), points, through, layers)
 
 
-def _meet(
+def meet(
     scene: mi.Scene, contact: mi.ShapePtr, start: mi.Point3f, direction: mi.Vector3f
 ) -> mi.SurfaceInteraction3f:
     """Where rays going up meet the scene; one that slips between two triangles tries again a hair aside."""

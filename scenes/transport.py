@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from . import trace
 from .bsdf import Table
+from .gather import meet
 from .irradiance import AngularBasis, Entrance, smooth, transmitted
 from .sensor import Led, Sensor
 from .spread import Spread
@@ -77,7 +78,7 @@ def survey(scene: mi.Scene, sensor: Sensor) -> Ground:
     x, y = (mi.Float(values.ravel().astype(np.float32)) for values in np.meshgrid(middles, middles))
     contact = next(shape for shape in scene.shapes() if shape.id() == "contact")
     height = -0.5 * sensor.guide.thickness_mm
-    si = scene.ray_intersect(mi.Ray3f(mi.Point3f(x, y, height), mi.Vector3f(0.0, 0.0, 1.0)))
+    si = meet(scene, mi.ShapePtr(contact), mi.Point3f(x, y, height), mi.Vector3f(0.0, 0.0, 1.0))
     meets = si.is_valid() & (si.shape == mi.ShapePtr(contact))
     fraction = dr.select(meets, contact.eval_attribute_1("vertex_contact_fraction", si, meets), 0.0)
     found = [np.asarray(values).reshape(GRID, GRID) for values in (fraction, meets)]

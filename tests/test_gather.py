@@ -62,3 +62,17 @@ def test_led_in_sight_and_its_mirror_image_are_as_path_sees_them(variant: str) -
         assert mean.max() > 3 * beside
         # one ray a pixel against many: the rim of the LED differs from pixel to pixel, its light hardly
         np.testing.assert_allclose((here - beside).sum(), (mean - beside).sum(), rtol=0.05)
+
+
+def test_survey_meets_the_surface_in_every_cell(variant: str) -> None:
+    """Its rays, too, run along the mesh's diagonals: a cell that slipped through would be a hole."""
+    from scenes import Renderer, build, surface, transport
+
+    renderer = Renderer(paper_sensor(columns=96, rows=64, pixel_um=(67.0, 75.0)), "cpu")
+    for factor in (1.0, 1.001, 0.7):
+        deformed = bump()
+        deformed.point_data["displacement"] = factor * np.asarray(deformed.point_data["displacement"])
+        build.put_surface(renderer.scene, renderer.sensor, surface.resample(deformed, 25.0))
+        ground = transport.survey(renderer.scene, renderer.sensor)
+        assert ground.meets.all()
+        assert ground.fraction.min() > 0.0
