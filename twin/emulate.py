@@ -109,6 +109,8 @@ def summary(emulator: fem.Emulator, out: str) -> str:
                 f"tared {name}, {what}: largest error off the edge {typical:.2g} % of its maximum (median of "
                 f"held-out samples), {bad:.2g} % (95th percentile)"
             )
+        typical, bad = (errors.percentile("pressure", percent, size, 2) for percent in (50, 95))
+        lines.append(f"tared pressure, {what}: on the whole surface {typical:.2g} % and {bad:.2g} %")
     for count, more, seconds, median, bad, *_ in errors.curve:
         solves = f"{count:.0f} samples" + (f" ({more:.0f} at finite strain)" if more else "")
         lines.append(
