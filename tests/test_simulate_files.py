@@ -156,7 +156,14 @@ def test_an_interrupt_is_heard_even_while_things_are_imported(number, delay, tmp
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent.parent), "CUDA_VISIBLE_DEVICES": ""}
     arguments = [sys.executable, "-m", "twin", "demo", "--quality", "reference", "--out", "out"]
     with subprocess.Popen(
-        arguments, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        arguments,
+        cwd=tmp_path,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        # a shell ignores it for its jobs in the background, and so would what they start
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     ) as run:
         time.sleep(delay)
         run.send_signal(number)
@@ -175,11 +182,14 @@ def test_an_interrupt_inside_an_import_is_raised_after_it(tmp_path, monkeypatch)
         "except BaseException:\n    loaded = 'swallowed'\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
-    module = None
-    with pytest.raises(KeyboardInterrupt), guarded():
-        import slow_to_load as module
+    module, kept = None, signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt), guarded():
+            import slow_to_load as module
 
-        time.sleep(5)
+            time.sleep(5)
+    finally:
+        signal.signal(signal.SIGINT, kept)
     assert module.loaded == "whole"
 
 
