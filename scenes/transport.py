@@ -140,10 +140,10 @@ def transport(
     maps, sinks, trapped, _ = walk(0, each, None)
     landed = straight + smooth(maps, GRID // trace.CELLS)
     total = newest = _spread(entrance, behind, ground, landed)
-    ratio = np.zeros(n_led)
+    ratio = np.ones(n_led)
     for order in range(1, _ORDERS + 1):
         before = newest[:, 0].sum(axis=(1, 2))
-        if before.sum() <= _ENOUGH * total[:, 0].sum():
+        if (before * ratio).sum() <= _ENOUGH * total[:, 0].sum():
             break
         maps, more, _, begun = walk(order, max(each >> min(2 * order, 6), 2), newest)
         sinks = sinks + more

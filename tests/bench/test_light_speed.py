@@ -26,6 +26,7 @@ CROP = (230, 262, 368, 400)  # in the blob
 PATH_SAMPLES = 2048
 FRAMES_PER_MINUTE, RELIGHT_MS, GROWTH_PERCENT, MEMORY_GIB = 60.0, 20.0, 5.0, 1.0
 FRAMES = 60
+PATHS = 2**15  # per LED: noise below NOISE_PERCENT
 
 
 def sensor(coupling: str = "air") -> Sensor:
@@ -107,7 +108,7 @@ def test_frames_a_minute(variant: str, tmp_path: Path) -> None:
         if number == 0:
             start = time.perf_counter()
         surface.point_data["pressure"] = np.asarray(surface.point_data["pressure"]) * 1.001
-        found = renderer.render(surface, quality="preview", seed=number + 3)
+        found = renderer.render(surface, quality="preview", seed=number + 3, samples=PATHS)
         counts = expose(renderer.sensor.camera, found.radiance.sum(axis=0, dtype=np.float64), 550.0, rng)
         write_png(tmp_path / "frame.png", counts)
         noise = found.noise_percent
@@ -127,6 +128,7 @@ def test_frames_a_minute(variant: str, tmp_path: Path) -> None:
     )
     assert relight < RELIGHT_MS
     assert growth < GROWTH_PERCENT
+    assert noise < NOISE_PERCENT
     assert rate >= FRAMES_PER_MINUTE
 
 
