@@ -6,6 +6,7 @@ from __future__ import annotations
 import io
 import os
 import zipfile
+import zlib
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -68,8 +69,10 @@ def load_emulator(place: str | Path) -> Emulator:
         ValueError,
         EOFError,
         OverflowError,
+        MemoryError,  # a header may announce any size
         zipfile.BadZipFile,
-        NotImplementedError,
+        zlib.error,
+        RuntimeError,  # zipfile's word for encrypted parts, and for methods that it does not know
     ) as e:
         why = " ".join(str(e).split())[:200] or type(e).__name__
         raise NotAnEmulator(

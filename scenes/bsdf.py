@@ -126,8 +126,9 @@ def read_table(filename: str) -> mi.TensorXf:
     """
     path = mi.file_resolver().resolve(filename)
     try:
-        packed = np.load(str(path), allow_pickle=False)
-    except (OSError, ValueError) as error:
+        with open(str(path), "rb") as file:
+            packed = np.lib.format.read_array(file, allow_pickle=False)
+    except (OSError, ValueError, EOFError, MemoryError) as error:
         raise ValueError(
             f"frustrated_tir: filename: received {filename!r} ({error}); allowed a table"
         ) from None

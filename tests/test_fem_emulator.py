@@ -264,6 +264,34 @@ def changed(place: Path, name: str, array: np.ndarray) -> Path:
     return out
 
 
+def deflated(place: Path) -> bytearray:
+    """The same archive, compressed."""
+    data = io.BytesIO()
+    with zipfile.ZipFile(place) as old, zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED) as new:
+        for entry in old.namelist():
+            new.writestr(entry, old.read(entry))
+    return bytearray(data.getvalue())
+
+
+def encrypted(place: Path) -> bytes:
+    """All parts said to be encrypted: bit 0 of the flags in local and central headers."""
+    data = deflated(place)
+    for signature, flags in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
+        at = data.find(signature)
+        while at >= 0:
+            data[at + flags] |= 1
+            at = data.find(signature, at + 4)
+    return bytes(data)
+
+
+def undeflatable(place: Path) -> bytes:
+    """The first part's compressed bytes overwritten."""
+    data = deflated(place)
+    start = 30 + int.from_bytes(data[26:28], "little")
+    data[start : start + 6] = b"\xff" * 6
+    return bytes(data)
+
+
 def test_a_strangers_file_is_not_trusted(
     emulator: Emulator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -283,6 +311,10 @@ def test_a_strangers_file_is_not_trusted(
     assert not (tmp_path / "exploded").exists()
     for data in (b"", b"PK", place.read_bytes()[:-30], b"\x80\x04N."):
         (tmp_path / "bad.npz").write_bytes(data)
+        with pytest.raises(NotAnEmulator):
+            load_emulator(tmp_path / "bad.npz")
+    for damaged in (encrypted(place), undeflatable(place)):
+        (tmp_path / "bad.npz").write_bytes(damaged)
         with pytest.raises(NotAnEmulator):
             load_emulator(tmp_path / "bad.npz")
     with pytest.raises(FileNotFoundError):

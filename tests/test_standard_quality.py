@@ -58,7 +58,9 @@ def binned(picture: np.ndarray) -> np.ndarray:
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-@pytest.mark.xfail(reason="the width of the spread follows the angle of entry only to second order")
+@pytest.mark.xfail(
+    raises=AssertionError, reason="the width of the spread follows the angle of entry only to second order"
+)
 @pytest.mark.parametrize("name", CASES)
 def test_standard_is_the_reference(variant: str, name: str) -> None:
     standard, runs = pictures(name)
@@ -81,4 +83,4 @@ def test_standard_is_the_reference(variant: str, name: str) -> None:
         print(f"{name}, {what}: worst {np.asarray(off)[worst]:+.2f} ± {np.asarray(error)[worst]:.2f} %")
     for what, allowed in (("blob", 0.5), ("background", 0.5), ("profile", 0.5), ("bins", 3.0)):
         off, error = found[what]
-        assert np.all(np.abs(off) < allowed + 3 * error), what
+        assert np.all(np.abs(off) < allowed + 2 * error), what

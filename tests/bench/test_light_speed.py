@@ -95,6 +95,7 @@ def test_equal_noise_sooner_than_path(variant: str, coupling: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="memory is read from /proc")
 def test_frames_a_minute(variant: str, tmp_path: Path) -> None:
     """Four-LED frames of 768 x 492 from surface to PNG, and what memory they take; then other intensities."""
     from scenes import Renderer, expose
@@ -133,7 +134,5 @@ def test_frames_a_minute(variant: str, tmp_path: Path) -> None:
 
 
 def _resident_gib() -> float:
-    if not sys.platform.startswith("linux"):
-        pytest.skip("reads /proc")
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * resource.getpagesize() / 2**30
