@@ -12,7 +12,7 @@ import io
 import os
 import secrets
 import struct
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +37,11 @@ class ImageError(ValueError):
 
 
 def write_exr(
-    path: StrPath, channels: Mapping[str, NDArray[Any]], header: Mapping[str, str] | None = None
+    path: StrPath,
+    channels: Mapping[str, NDArray[Any]],
+    header: Mapping[str, str] | None = None,
+    *,
+    half: Collection[str] = (),
 ) -> None:
     """Write float32 planes, lossless (ZIP, blocks of 16 rows: readable everywhere).
 
@@ -47,11 +51,13 @@ def write_exr(
         All of one shape; names such as ``led.0``, ``pressure``, ``displacement.z``.
     header : name -> text
         Kept beside the pixels; no dates are added.
+    half
+        Planes to write as half floats where `fits_half` says that this loses nothing that matters.
     """
     path = Path(path)
     if not channels:
         raise ImageError(f"{path}: channels: received none, allowed: at least one")
-    planes: dict[str, NDArray[np.float32]] = {}
+    planes: dict[str, NDArray[Any]] = {}
     shape: tuple[int, ...] | None = None
     for name, plane in channels.items():
         array = np.asarray(plane)
@@ -63,6 +69,7 @@ def write_exr(
             )
         if not 1 <= len(name.encode()) <= 255 or "\0" in name:
             raise ImageError(f"{path}: channel name: received {name!r}, allowed: 1 to 255 bytes")
+        array = array.astype(np.float16) if name in half and fits_half(array) else array
         planes[name] = np.ascontiguousarray(array)  # OpenEXR 3.5 ignores strides: pixels get scrambled
     text = dict(header or {})
     for key, value in text.items():
@@ -72,6 +79,29 @@ def write_exr(
     stream = io.BytesIO()
     OpenEXR.File(attributes, planes, num_threads=0).write(stream)
     write_bytes(path, stream.getvalue())
+
+
+def flat_planes(layers: Mapping[str, NDArray[np.float32]]) -> dict[str, NDArray[np.float32]]:
+    """Return layers of colour, (rows, columns, 3), as NAME.R, NAME.G and NAME.B; others as they are."""
+    return {
+        f"{name}.{channel}" if channel else name: np.ascontiguousarray(plane)
+        for name, layer in layers.items()
+        for channel, plane in (
+            zip("RGB", np.moveaxis(layer, 2, 0), strict=True) if layer.ndim == 3 else [("", layer)]
+        )
+    }
+
+
+def fits_half(plane: NDArray[np.float32]) -> bool:
+    """Whether half floats keep a plane: each value within 2^-11 of itself, or of the plane's largest / 1000.
+
+    Half floats have 11 significant bits down to 6.1e-5, so rounding is 0.014 % rms: a camera's pixel of
+    45 000 electrons, the best that light can be known by, is uncertain by 0.5 %.
+    """
+    with np.errstate(over="ignore"):
+        rounded = plane.astype(np.float16).astype(np.float32)
+    size = np.abs(plane)
+    return bool(np.all(np.abs(rounded - plane) <= 2.0**-11 * np.maximum(size, 1e-3 * size.max())))
 
 
 def read_exr(path: StrPath) -> dict[str, NDArray[np.float32]]:

@@ -19,8 +19,9 @@ from scenes.sensor import NotModelled
 from twin import presses
 from twin.complaint import DesignError
 from twin.design import Design
+from twin.exposure import saturated_percent
 from twin.frame import grey
-from twin.simulation import Device, saturated_percent
+from twin.simulation import Device
 
 if TYPE_CHECKING:
     import pyvista as pv

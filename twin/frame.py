@@ -174,17 +174,17 @@ def _holds_one_frame(folder: Path) -> bool:
 def _write(frame: Frame, folder: Path) -> None:
     # Slow to import, and a look at `twin --help` needs none of them.
     from scenes.camera import count_dtype, tare
-    from scenes.exr import write_exr, write_png
+    from scenes.exr import flat_planes, write_exr, write_png
     from twin.pictures import overview
 
-    layers = _planes({f"led.{number}": layer for number, layer in enumerate(frame.radiance)})
+    layers = flat_planes({f"led.{number}": layer for number, layer in enumerate(frame.radiance)})
     fields = {"pressure": frame.pressure, "displacement.z": frame.displacement_z}
     units = {"pressure": "kPa", "displacement.z": "mm", **dict.fromkeys(layers, "W m-2 sr-1")}
     write_exr(folder / "frame.exr", {**layers, **fields}, {f"unit.{name}": units[name] for name in units})
     whole = count_dtype(frame.design.camera.bits)
     for name, counts in (("image", frame.image), ("reference", frame.reference)):
         if counts.dtype == np.float32:
-            planes = _planes({"counts": counts})
+            planes = flat_planes({"counts": counts})
             write_exr(folder / f"{name}.exr", planes, {f"unit.{plane}": "DN" for plane in planes})
         write_png(folder / f"{name}.png", np.rint(counts).astype(whole))
     write_png(folder / "tared.png", tare(frame.image, frame.reference, frame.design.camera.bits))
@@ -194,17 +194,6 @@ def _write(frame: Frame, folder: Path) -> None:
     record["sha256"] = {path.name: _sha256(path) for path in sorted(folder.iterdir())}
     text = json.dumps(record, indent=2, allow_nan=False, ensure_ascii=False, default=np.generic.item)
     (folder / RECORD).write_text(text + "\n", encoding="utf-8")
-
-
-def _planes(layers: dict[str, NDArray[np.float32]]) -> dict[str, NDArray[np.float32]]:
-    """Return layers of colour, (rows, columns, 3), as NAME.R, NAME.G and NAME.B; others as they are."""
-    return {
-        f"{name}.{channel}" if channel else name: np.ascontiguousarray(plane)
-        for name, layer in layers.items()
-        for channel, plane in (
-            zip("RGB", np.moveaxis(layer, 2, 0), strict=True) if layer.ndim == 3 else [("", layer)]
-        )
-    }
 
 
 def _sha256(path: Path) -> str:

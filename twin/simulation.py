@@ -7,16 +7,22 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, SupportsIndex, TypedDict, Unpack, overload
-
-import numpy as np
+from typing import TYPE_CHECKING, Literal, SupportsIndex, TypedDict, Unpack, overload
 
 import fem
-from estimation import scalars
 from twin import presses
 from twin.complaint import DesignError, shown
 from twin.design import Design, load_design
-from twin.frame import Frame, grey
+from twin.exposure import (
+    how_pressed,
+    light_seed,
+    mechanics_facts,
+    picture_facts,
+    seen_pressure,
+    take,
+    take_reference,
+)
+from twin.frame import Frame
 from twin.presses import Mechanics, Quality
 
 if TYPE_CHECKING:
@@ -26,12 +32,6 @@ if TYPE_CHECKING:
 Device = Literal["auto", "cpu", "cuda"]
 Progress = Callable[[str, float], None]
 """Called with the name of the stage that runs now and the share of all work that is done, 0 to 1."""
-
-REFERENCE_FRAMES = 16
-"""Noisy frames whose mean is the camera's reference."""
-
-# Purposes of random numbers: children of the seed, so that one more draw for one leaves the others alone.
-_LIGHT, _PICTURE, _REFERENCE = range(3)
 
 
 @dataclass(frozen=True)
@@ -206,13 +206,7 @@ def _frame(
     level: float,
     tell: Callable[[float], None],
 ) -> Frame:
-    from scenes.lens import through
-
     start = time.perf_counter()
-    camera, wavelength, k = design.camera, design.light.wavelength_nm, design.signal.counts
-    sensor = renderer.sensor
-    # The same with and without the inclusion, so that their noise cancels; 26 bits leave room for the LEDs.
-    light = int(_random(seed, _LIGHT).generate_state(1)[0]) >> 6
 
     def render(field: str, before: float) -> Rendering:
         return renderer.render(
@@ -220,87 +214,35 @@ def _frame(
             field=field,
             quality=quality,
             noise=noise,
-            seed=light,
+            seed=light_seed(seed),  # the same with and without the inclusion, so that their noise cancels
             progress=lambda share: tell(before + 0.5 * share),
         )
 
-    def received(rendering: Rendering) -> np.ndarray:
-        return through(sensor, rendering.radiance.sum(axis=0, dtype=np.float64))
-
-    def expose(rendering: Rendering, purpose: int, frames: int) -> np.ndarray:
-        from scenes.camera import expose
-
-        rng = np.random.Generator(np.random.PCG64(_random(seed, purpose, round(level * 1e6))))
-        return expose(camera, received(rendering), wavelength, rng, frames=frames)
-
     lit = render("pressure", 0.0)
     unlit = render("pressure_0", 0.5) if inclusion is not None else lit
-    image = expose(lit, _PICTURE, camera.frames)
-    reference = expose(unlit, _REFERENCE, max(REFERENCE_FRAMES, camera.frames)).astype(np.float32)
+    image = take(design, lit.radiance, seed, level)
+    reference = take_reference(design, unlit.radiance, seed, level)
     tell(1.0)
     return Frame(
         design=design,
         inclusion=inclusion,
-        press=_how(design, press),
+        press=how_pressed(design, press),
         seed=seed,
         image=image,
         reference=reference,
         radiance=lit.radiance,
-        # between nodes with and without contact the optics' spline swings below zero
-        pressure=np.maximum(lit.pressure, 0.0),
+        pressure=seen_pressure(lit),
         displacement_z=lit.displacement_z,
         surface=press.surface,
         cut=getattr(press, "cut", None),
         fem={
-            **fem.scalars(press.surface, design.signal.displacement_um),
-            "min_pressure_kPa": press.min_pressure_kPa,
-            "path": press.path,
-            **_mechanics(press),
-            "error_percent": press.error_percent,
+            **mechanics_facts(design, press),
             "dof": getattr(press, "dof", None),
             "seconds": press.seconds,
         },
         tsis={
-            "raw": scalars(grey(image), k),
-            "tared": scalars(grey(image) - grey(reference), k),
+            **picture_facts(design, image, reference, lit.radiance),
             "seconds": time.perf_counter() - start,
             "noise_percent": lit.noise_percent,
-            "saturated_percent": saturated_percent(design, image, received(lit)),
         },
     )
-
-
-def _mechanics(press: Press | Emulated) -> dict[str, str]:
-    """Return who computed the press: an emulator is named besides what it learned."""
-    if press.path == "emulated":
-        return {"mechanics": "emulator", "emulated": press.mechanics}
-    return {"mechanics": press.mechanics}
-
-
-def _how(design: Design, press: Press | Emulated) -> dict[str, Any]:
-    """Return depth, force and pose, as `frame.json` names them."""
-    return {
-        "indentation_mm": press.indentation_mm,
-        "force_N": press.force_N,
-        "position_mm": list(design.press.position_mm),
-        "tilt_deg": list(design.press.tilt_deg),
-    }
-
-
-def saturated_percent(design: Design, image: np.ndarray, radiance: np.ndarray) -> float:
-    """Return the share of pixels at the converter's last count or at the full well, per cent.
-
-    ``image`` is (rows, columns[, 3]) counts, ``radiance`` the same of what the lens lets through, W m⁻² sr⁻¹.
-    """
-    from scenes.camera import mean_counts
-
-    camera = design.camera
-    well = camera.offset_dn + camera.full_well_e * camera.binning**2 / camera.gain_e_per_dn
-    mean = mean_counts(camera, radiance, design.light.wavelength_nm)
-    full = (image >= 2**camera.bits - 1) | (mean >= well * (1 - 1e-12))
-    return 100.0 * float(full.mean())
-
-
-def _random(seed: int, *purpose: int) -> np.random.SeedSequence:
-    """Return the child of the seed for one purpose, and for one press level where it is named (µm or µN)."""
-    return np.random.SeedSequence(seed, spawn_key=purpose)
