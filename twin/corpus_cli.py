@@ -16,6 +16,18 @@ def run(arguments: argparse.Namespace) -> int:
 def _plan(arguments: argparse.Namespace) -> int:
     if arguments.out is None:
         raise DesignError("--out", "nothing", "the folder to make for the corpus")
+    from twin.plan import freeze
+
+    freeze(
+        arguments.study,
+        arguments.out,
+        seed=arguments.seed,
+        mechanics=arguments.mechanics,
+        emulator=arguments.emulator,
+        quality=arguments.quality,
+        light=arguments.light,
+        count=arguments.count,
+    )
     return 0
 
 
