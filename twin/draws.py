@@ -1,9 +1,10 @@
-"""Random numbers of a corpus: counter-based, so that a sample's draws depend on nothing but its own place.
+"""Random numbers of a corpus: counter-based, so that a sample's draws depend on nothing but its place.
 
-Every purpose (an inclusion's parameter, a field of the design, the light) has its own stream: Philox (Salmon et
-al. 2011; [salmon2011]) under a key of seed, group, purpose and attempt. A sample's number is the one that
+Every purpose (an inclusion's parameter, a field of the design, the light) has its own stream: Philox (Salmon
+et al. 2011; [salmon2011]) under a key of seed, group, purpose and attempt. A sample's number is the one that
 stands at its place in the stream, so no count, order or other purpose moves it. Only the generator's raw
-integers are used, whose sequence numpy keeps for good; distributions are their own quantile functions.
+integers are used, whose sequence numpy keeps for good; distributions are their own quantile functions. Latin
+and Sobol sequences are of a group as a whole.
 """
 
 from __future__ import annotations

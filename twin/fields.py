@@ -160,9 +160,9 @@ def _number(
             f"'integer' or 'choice' for {field}" if kind == "integer" else f"another: {field} is a number"
         )
         raise DesignError(f"{where}.distribution", shown(name), allowed)
-    if name == "choice" and kind == "integer":
-        if distribution.relative or not all(v.is_integer() for v in distribution.of or ()):
-            raise DesignError(f"{where}.of", shown(list(distribution.of or ())), f"integers for {field}")
+    of = distribution.of or ()
+    if kind == "integer" and of and (distribution.relative or not all(v.is_integer() for v in of)):
+        raise DesignError(f"{where}.of", shown(list(of)), f"integers for {field}")
     leans = factor(distribution) or (name == "normal" and distribution.mean is None)
     if leans and value is None:
         raise DesignError(where, f"{field}, which the design does not set", "a field that it sets")

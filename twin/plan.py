@@ -77,9 +77,8 @@ def freeze(
             design = design.pressed(mechanics=mechanics)
         setting = _setting(source, design, settings.seed if seed is None else seed, file)
     except DesignError as error:
-        raise error.renamed(
-            re.sub(r"^press\.(indentation_mm)", r"\1", error.field), source=source.name
-        ) from None
+        field = re.sub(r"^press\.(indentation_mm)", r"\1", error.field)
+        raise error.renamed(field, source=error.source or source.name) from None
     with staged(out, holds_plan) as folder:
         groups = []
         try:

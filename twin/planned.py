@@ -101,8 +101,8 @@ class Plan:
     ----------
     folder : the corpus's.
     head : what plan.json says; the attributes below are its.
-    columns : of samples.parquet by name, (n,) each: float64, but "sample" int64, "blank" bool, and "group" the
-        number of its group, int64.
+    columns : of samples.parquet by name, (n,) each: float64, but "sample" int64, "blank" bool, and "group"
+        the number of its group, int64.
     """
 
     folder: Path

@@ -30,12 +30,13 @@ MAX_ATTEMPTS = 100
 """Draws of one sample before the study is given up."""
 MAX_REFUSED = 0.9
 """Largest share of draws that may be refused in a group."""
+_ROOMS = ("fem.", "scenes.", "twin.")
 _SOON = 200  # draws after which that share is looked at
 
 
 @dataclass(frozen=True)
 class Setting:
-    """What all groups share: the design as nested tables and as itself, its numbers that vary, who presses."""
+    """What all groups share: the design, as nested tables too, its numbers that vary, who presses."""
 
     seed: int
     tables: Mapping[str, Any]
@@ -83,7 +84,8 @@ def drawn(
         In one line, about the group ``where``: for a listed sample that cannot be simulated, and for ranges
         of which hardly any draw can.
     """
-    stream, fixed = Stream(setting.seed, group.name), ()
+    stream = Stream(setting.seed, group.name)
+    fixed: tuple[str, ...] = ()
     if group.grid is not None:
         columns = read_grid(group.grid)
     elif group.table is not None:
@@ -128,7 +130,7 @@ def fields_of(varied: list[Varied], numbers: Callable[[str], NDArray[np.float64]
     for one in varied:
         unit = numbers(one.purpose)
         if factor(one.distribution):  # of what the design says, or of an earlier factor
-            values = columns.get(one.field, one.base) * draw(one.distribution, 1.0, unit)
+            values = draw(one.distribution, 1.0, unit) * columns.get(one.field, np.asarray(one.base))
         else:
             values = draw(one.distribution, one.base, unit)
         columns[one.field] = values
@@ -146,11 +148,8 @@ def _refusal(setting: Setting, columns: Columns, number: int) -> str | None:
     except ValidationError as error:  # an inclusion beyond all bounds
         return f"inclusion: {error.errors()[0]['msg']}"
     except ValueError as error:
-        if (
-            not type(error).__module__.startswith(("fem.", "scenes.", "twin."))
-            and type(error) is not ValueError
-        ):
-            raise
+        if not type(error).__module__.startswith(_ROOMS) and ": received " not in str(error):
+            raise  # a mistake of this program
         return str(error)
     return None
 
@@ -162,8 +161,6 @@ def _give_up(where: str, refused: Counter[str], draws: int) -> None:
         kinds[reason.partition(":")[0]] += times
     kind, times = kinds.most_common(1)[0]
     example = next(reason for reason in refused if reason.partition(":")[0] == kind)
-    raise DesignError(
-        where,
-        f"ranges of which {refused.total()} of {draws} draws cannot be simulated, {times} of them like: {example}",
-        f"ranges of which at most {MAX_REFUSED:.0%} are refused",
-    )
+    received = f"ranges of which {refused.total()} of {draws} draws cannot be simulated"
+    allowed = f"ranges of which at most {MAX_REFUSED:.0%} cannot ({times} of them like: {example})"
+    raise DesignError(where, received, allowed)

@@ -1,6 +1,6 @@
-"""A study of kind "corpus": what is sampled and what is randomised, as a frozen, checked value from a TOML file.
+"""A study of kind "corpus": what is sampled and randomised, as a frozen, checked value from a TOML file.
 
-A study of kind "layout", which compares sensors, is not read yet. Fields, defaults and an example: CORPORA.md.
+A study of kind "layout", which compares sensors, comes later. Fields, defaults and an example: CORPORA.md.
 """
 
 from __future__ import annotations
