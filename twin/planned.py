@@ -153,6 +153,13 @@ class Plan:
         return self.head.light_seed
 
     @property
+    def shares_references(self) -> bool:
+        """Whether the pictures without inclusion are the same for all samples: an emulator's press of one
+        design, in the same light."""
+        varies = any("." in name for name in self.columns)
+        return self.mechanics == "emulator" and self.light_seed == "shared" and not varies
+
+    @property
     def groups(self) -> tuple[PlannedGroup, ...]:
         return self.head.groups
 

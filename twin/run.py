@@ -7,6 +7,7 @@ neither workers nor order nor an interruption show in it.
 
 from __future__ import annotations
 
+import asyncio
 import json
 import queue
 import time
@@ -255,7 +256,7 @@ def _outcome(future: Future) -> Any:
     """Return what a task answered; where Dask could not run it at all, why."""
     try:
         return future.result()
-    except Exception as error:
+    except (Exception, asyncio.CancelledError) as error:
         name = type(error).__name__
         if name == "KilledWorker":
             return Trouble("KilledWorker: every worker that tried it died", traceback.format_exc())
