@@ -7,12 +7,14 @@ who counts, retries and records it is the run, not Dask.
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import os
 import socket
 import threading
 import traceback
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
@@ -147,8 +149,23 @@ def prepare() -> None:
     from scenes import backend
 
     threadpool_limits(1)  # of libraries that are loaded already
+    _keep_memory()
     backend.use("cpu")
     backend.threads(1)
+
+
+def _keep_memory() -> None:
+    """Have freed memory stay with the process, where glibc can be told so.
+
+    Dask starts workers with MALLOC_TRIM_THRESHOLD_=65536: whatever a solve frees goes back to the system at
+    once and comes again page by page, which takes as long as the solve.
+    """
+    arena_max, mmap_threshold, trim_threshold = -8, -3, -1  # malloc.h
+    with suppress(OSError, AttributeError):
+        mallopt = ctypes.CDLL(None).mallopt
+        mallopt(arena_max, 1)
+        mallopt(mmap_threshold, 32 * 2**20)  # the most that it takes
+        mallopt(trim_threshold, 256 * 2**20)
 
 
 @lru_cache(maxsize=2)
