@@ -35,7 +35,11 @@ def _tables(leds: int, rows: int) -> dict[str, Any]:
     design = tomllib.loads(files("assets").joinpath("designs", "tsis.toml").read_text(encoding="utf-8"))
     design["leds"] = design["leds"][:leds]
     camera = design["camera"]
-    camera |= {"rows": rows, "columns": rows * 4 // 3, "pixel_um": [8.4 * 768 / (rows * 4 // 3), 9.8 * 492 / rows]}
+    columns = rows * 4 // 3
+    pixel = [8.4 * 768 / columns, 9.8 * 492 / rows]
+    # Larger pixels gather more light: keep the counts those of the shipped camera.
+    exposure = camera["exposure_ms"] * (8.4 * 9.8) / (pixel[0] * pixel[1])
+    camera |= {"rows": rows, "columns": columns, "pixel_um": pixel, "exposure_ms": exposure}
     return design
 
 

@@ -49,13 +49,14 @@ examples:
 """
 
 _VERIFY = """\
-Read every file of a corpus and compare it with its SHA-256, the frames with the plan, the index with the frames;
-then simulate a few random samples again and compare the bytes. Names whatever is wrong, a line each, and exits 1.
+Read every file of a corpus and compare it with its SHA-256, the frames with the plan, the index with the
+frames; then simulate a few random samples again and compare the bytes. Names whatever is wrong, a line each, and
+exits 1.
 
 examples:
   twin corpus verify corpora/paper
   twin corpus verify corpora/paper --resimulate 10 --workers 2
-  twin corpus verify corpora/paper --resimulate 0 --repair && twin corpus run corpora/paper
+  twin corpus verify corpora/paper --repair; twin corpus run corpora/paper
 """
 
 
@@ -112,9 +113,15 @@ def _add_plan(actions: Any) -> None:
 def _add_run(actions: Any) -> None:
     run = _parser(actions, "run", "make what is missing", _RUN)
     run.add_argument("directory", metavar="DIR", help="folder of the corpus")
-    run.add_argument("--workers", type=whole, metavar="N", help="processes on this machine (default: one per core)")
-    run.add_argument("--scheduler", metavar="ADDRESS", help="a Dask scheduler, as tcp://127.0.0.1:8786, instead")
-    run.add_argument("--retries", type=whole, default=1, metavar="N", help="for a sample that fails (default 1)")
+    run.add_argument(
+        "--workers", type=whole, metavar="N", help="processes on this machine (default: one per core)"
+    )
+    run.add_argument(
+        "--scheduler", metavar="ADDRESS", help="a Dask scheduler, as tcp://127.0.0.1:8786, instead"
+    )
+    run.add_argument(
+        "--retries", type=whole, default=1, metavar="N", help="for a sample that fails (default 1)"
+    )
 
 
 def _add_status(actions: Any) -> None:
@@ -130,5 +137,9 @@ def _add_verify(actions: Any) -> None:
         "--resimulate", type=whole, default=2, metavar="N", help="random samples to make again (default 2)"
     )
     verify.add_argument("--seed", type=whole, default=0, metavar="N", help="which ones (default 0)")
-    verify.add_argument("--workers", type=whole, metavar="N", help="processes to make them (default: one per core)")
-    verify.add_argument("--repair", action="store_true", help="remove what is damaged, so that run makes it again")
+    verify.add_argument(
+        "--workers", type=whole, metavar="N", help="processes to make them (default: one per core)"
+    )
+    verify.add_argument(
+        "--repair", action="store_true", help="remove what is damaged, so that run makes it again"
+    )

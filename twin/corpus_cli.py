@@ -74,13 +74,19 @@ def _run(arguments: argparse.Namespace) -> int:
             return _failed("run", str(error))
         except KeyboardInterrupt:
             tell.close()
-            print("twin corpus run: interrupted; what is finished stays, run again continues", file=sys.stderr)
+            print(
+                "twin corpus run: interrupted; what is finished stays, run again continues", file=sys.stderr
+            )
             return 130
-    print(f"{state.done} of {state.planned} samples are there, {state.made} of them new: {arguments.directory}")
+    print(
+        f"{state.done} of {state.planned} samples are there, {state.made} of them new: {arguments.directory}"
+    )
     for line in state.notes:
         print(line)
     if state.failed:
-        return _failed("run", f"{state.failed} samples failed; twin corpus status {arguments.directory} says why")
+        return _failed(
+            "run", f"{state.failed} samples failed; twin corpus status {arguments.directory} says why"
+        )
     return 0
 
 

@@ -1,7 +1,7 @@
 """Run a corpus: make every sample of its plan that is not there yet, on as many processes as there are.
 
-A sample's mechanics and its light are two tasks, and only a few samples per worker are on their way at a time,
-so that a million of them do not weigh on the scheduler. What a sample is depends on plan and number alone:
+A sample's mechanics and its light are two tasks, and only a few samples per worker are on their way at a
+time, so that a million of them do not weigh on the scheduler. What a sample is depends on plan and number alone:
 neither workers nor order nor an interruption show in it.
 """
 
@@ -127,9 +127,11 @@ def run(
                 if scheduler is None or state.done + state.failed >= state.planned:
                     sweep(folder)  # what workers left that were killed
                 table.write()
-                state.notes += [f"cannot be read: {line}" for line in list(table.bad.values())[:10]]
                 if table.bad:
-                    state.notes.append(f"{len(table.bad)} samples cannot be read: twin corpus verify DIR --repair")
+                    line = next(iter(table.bad.values()))
+                    state.notes.append(
+                        f"{len(table.bad)} samples cannot be read, see verify --repair: {line}"
+                    )
     except OSError as error:
         raise Stopped(labour.trouble(error).error) from error
     return state
