@@ -9,6 +9,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import fem
 from twin import store
 
 STUDY = """\
@@ -101,3 +102,25 @@ def hashes(corpus: Path) -> dict[str, str]:
         for path in sorted((corpus / folder).rglob("*.*"))
         if path.is_file() and path.name != store.SAMPLE
     }
+
+
+def make_up_emulator(place: Path) -> Path:
+    """Write an emulator that answers at once; what it learned was made up."""
+    from test_simulate_emulator import invented
+
+    fem.save_emulator(invented("finite"), place)
+    return place
+
+
+def finish_tiny(folder: Path, count: int = 4, levels: tuple[float, ...] = (1.0, 2.0)) -> Path:
+    """Freeze and make a corpus with the made-up emulator, in this process; return its folder."""
+    from twin import index, sample
+    from twin.plan import load_plan
+
+    folder.mkdir(parents=True, exist_ok=True)
+    corpus = freeze_tiny(folder, count, levels, emulator=make_up_emulator(folder / "made-up.npz"))
+    plan = load_plan(corpus)
+    for number in range(count):
+        sample.make(plan, number, corpus)
+    index.build(corpus, plan, store.sha256(corpus / "plan.json"))
+    return corpus

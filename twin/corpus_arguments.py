@@ -50,8 +50,8 @@ examples:
 
 _VERIFY = """\
 Read every file of a corpus and compare it with its SHA-256, the frames with the plan, the index with the
-frames; then simulate a few random samples again and compare the bytes. Names whatever is wrong, a line each, and
-exits 1.
+frames; then simulate a few random samples again and compare the bytes. Names whatever is wrong, a line each,
+and exits 1.
 
 examples:
   twin corpus verify corpora/paper

@@ -24,7 +24,6 @@ _QUIET: dict[str, Any] = {
     "distributed.scheduler.worker-ttl": None,  # a solve may hold Python for minutes
     "distributed.comm.retry.count": 3,
     "distributed.admin.low-level-log-length": 1000,
-    "distributed.nanny.environ": {},
 }
 
 
@@ -43,10 +42,9 @@ def crew(workers: int | None, scheduler: str | None) -> Iterator[Client]:
     # Before Dask is imported, here and in its workers: it tells a terminal a lot that is no news to a user.
     os.environ[QUIET] = "CRITICAL"
     import dask
+    from distributed import Client
 
     with dask.config.set(_QUIET):
-        from distributed import Client
-
         for name in ("distributed", "tornado.application", "asyncio"):
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)
         if scheduler is not None:

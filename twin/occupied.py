@@ -54,12 +54,8 @@ def _open(place: Path) -> int:
                     return handle
         except BlockingIOError:
             os.close(handle)
-            allowed = "one run at a time: wait for it, or stop it"
-            raise DesignError(
-                "DIR",
-                f"{shown(str(place.parent))}, which {holder(place.parent) or 'another'} is running",
-                allowed,
-            ) from None
+            received = f"{shown(str(place.parent))}, which {holder(place.parent) or 'another'} is running"
+            raise DesignError("DIR", received, "one run at a time: wait for it, or stop it") from None
         except BaseException:
             os.close(handle)
             raise
