@@ -37,7 +37,8 @@ def only_plan(corpus: Path, place: Path) -> Path:
     """A corpus of the same plan with nothing made yet."""
     place.mkdir(parents=True)
     for name in ("plan.json", "samples.parquet", "emulator.npz"):
-        shutil.copy(corpus / name, place / name)
+        if (corpus / name).exists():
+            shutil.copy(corpus / name, place / name)
     return place
 
 
@@ -200,7 +201,7 @@ def test_a_full_disk_is_trouble_for_all(tmp_path):
         wrapped.__cause__ = plain
         for error in (plain, wrapped):
             found = labour.trouble(error)
-            assert found.stops == stops
+            assert found.stops == (number != errno.ENOTDIR)
             assert found.error.startswith("the disk is full: ") == (number in labour.FULL)
     assert not labour.trouble(RuntimeError("one\ntwo")).stops
     assert labour.trouble(RuntimeError("one\ntwo")).error == "RuntimeError: one two"

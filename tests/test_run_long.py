@@ -1,4 +1,4 @@
-"""Runs of a corpus that are cut off, killed, short of room, or spread over machines: the same bytes each time."""
+"""Runs of a corpus that are cut off, killed, short of room, or spread over processes: always the same bytes."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def same(corpus: Path, other: Path) -> bool:
-    """Every frame is there once, its bytes are the other's, the index says so, and nothing else lies about."""
+    """Every frame is there once, its bytes are the other's, the index says so, and nothing else is left."""
     plan = load_plan(corpus)
     table = index.read(corpus, plan, store.sha256(corpus / "plan.json"))
     wanted = [(sample, level) for sample in range(len(plan)) for level in range(len(plan.indentation_mm))]
