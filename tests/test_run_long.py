@@ -1,4 +1,4 @@
-"""Runs of a corpus that are cut off, killed, short of room, or spread over processes: always the same bytes."""
+"""Runs of a corpus that are cut off, killed, short of room, spread over processes: always the same bytes."""
 
 from __future__ import annotations
 

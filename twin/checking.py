@@ -190,7 +190,7 @@ def check_index(
 ) -> Iterator[Problem]:
     """Yield where the index says other of these samples, neighbours, than their frames do (``rows``).
 
-    ``present`` are those that are there: what the index has of others was told already.
+    ``present`` are those whose frames can be read: what the index has of others was told already.
     """
     within = pc.and_(
         pc.greater_equal(table["sample"], numbers[0]), pc.less_equal(table["sample"], numbers[-1])

@@ -23,6 +23,8 @@ _QUIET: dict[str, Any] = {
     "distributed.scheduler.allowed-failures": 3,  # workers that a task may take with it
     "distributed.scheduler.worker-ttl": None,  # a solve may hold Python for minutes
     "distributed.comm.retry.count": 3,
+    "distributed.scheduler.http.routes": [],
+    "distributed.worker.http.routes": [],
     "distributed.admin.low-level-log-length": 1000,
 }
 
@@ -86,7 +88,10 @@ def _local(count: int) -> Iterator[Any]:
             threads_per_worker=1,
             processes=True,
             host="127.0.0.1",
-            dashboard_address=None,
+            # No dashboard, but Dask serves pages in any case: to this machine only, on any free port.
+            dashboard_address="127.0.0.1:0",
+            worker_dashboard_address="127.0.0.1:0",
+            scheduler_kwargs={"dashboard": False},
             memory_limit=0,
             silence_logs=logging.CRITICAL,
         )

@@ -150,8 +150,8 @@ def _check(
                 report.problems += problems
                 report.files += files
             if table is not None:
-                rows, _ = index.table_of(folder, plan, sorted(present), sha256)
-                report.problems += check_index(table, rows, numbers, present)
+                rows, bad = index.table_of(folder, plan, sorted(present), sha256)
+                report.problems += check_index(table, rows, numbers, present - bad.keys())
             done += len(numbers)
     if unmade:
         failed = sum(store.failure_file(folder, number).exists() for number in unmade)
