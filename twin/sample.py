@@ -108,10 +108,10 @@ def lit(plan: Plan, number: int, contacts: list[Contact], seconds: float, corpus
             written += time.perf_counter() - began
         hashes |= {path.name: store.sha256(path) for path in sorted(folder.iterdir())}
         took = {"mechanics": seconds, "light": time.perf_counter() - start - written, "write": written}
+        from scenes import exr
+
         told = {"sample": number, "sha256": hashes, "seconds": took, "versions": versions()}
-        (folder / store.SAMPLE).write_text(
-            json.dumps(told, indent=1, sort_keys=True) + "\n", encoding="utf-8"
-        )
+        exr.write_bytes(folder / store.SAMPLE, (json.dumps(told, indent=1, sort_keys=True) + "\n").encode())
         size = sum(path.stat().st_size for path in folder.iterdir())
     return {"sample": number, "seconds": took, "bytes": size}
 
