@@ -171,7 +171,10 @@ def _child(
         fixed = node.get("prefixItems", [])
         return fixed[step] if step < len(fixed) else node.get("items")
     named = node.get("properties", {}).get(step)
-    return named if named is not None else node.get("additionalProperties") or None  # false where forbidden
+    if named is not None:
+        return named
+    # keys that are names of the user's own; false where there are none
+    return next(iter(node.get("patternProperties", {}).values()), node.get("additionalProperties") or None)
 
 
 _BOUNDS = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}
@@ -183,6 +186,8 @@ def _in_words(schema: Mapping[str, Any], node: Mapping[str, Any] | None) -> str:
         return " or ".join(_in_words(schema, kind) for kind in node["oneOf"])
     if "enum" in node:
         return "one of " + ", ".join(repr(choice) for choice in node["enum"])
+    if "const" in node:
+        return repr(node["const"])
     match node.get("type"):
         case "boolean":
             return "true or false"

@@ -153,6 +153,16 @@ class Plan:
         return self.head.light_seed
 
     @property
+    def shares_references(self) -> bool:
+        """Whether pictures without inclusion are the same for all samples.
+
+        Where anything of the design varies they are not, nor where finite elements press: each inclusion
+        has a mesh of its own.
+        """
+        fields = any("." in name for name in self.columns)
+        return self.light_seed == "shared" and self.mechanics == "emulator" and not fields
+
+    @property
     def groups(self) -> tuple[PlannedGroup, ...]:
         return self.head.groups
 

@@ -57,8 +57,10 @@ def measure(plan: Plan, progress: Callable[[str, float], None] | None = None) ->
         sample.make(plan, first, Path(folder))
         once = time.perf_counter() - begun
         tell("probe", 0.5)
+        place = Path(folder) / "again"
+        place.mkdir()
         begun = time.perf_counter()
-        found = sample.make(plan, second, Path(folder) if second != first else Path(folder) / "again")
+        found = sample.make(plan, second, Path(folder) if second != first else place)
         again = time.perf_counter() - begun
         tell("probe", 1.0)
     seconds: Mapping[str, float] = found["seconds"]
