@@ -55,10 +55,16 @@ BAD = {
     "unknown parameter": (STUDY.replace("size_mm", "size"), ["samples.0.inclusion.size", "size_mm"]),
     "a reversed range": (STUDY.replace("[2, 13]", "[13, 2]"), ["samples.0.inclusion.size_mm", "[13.0, 2.0]"]),
     "an empty range": (STUDY.replace("[2, 13]", "[2, 2]"), ["samples.0.inclusion.size_mm", "one number"]),
-    "half a range": (STUDY.replace("[2, 13]", "[2]"), ["samples.0.inclusion.size_mm.1", "nothing", "a number"]),
+    "half a range": (
+        STUDY.replace("[2, 13]", "[2]"),
+        ["samples.0.inclusion.size_mm.1", "nothing", "a number"],
+    ),
     "a word": (STUDY.replace("[2, 13]", '"big"'), ["samples.0.inclusion.size_mm", "'big'", "a number"]),
     "NaN": (STUDY.replace("[2, 13]", "[nan, 13]"), ["samples.0.inclusion.size_mm.0", "nan", "finite"]),
-    "a negative size": (STUDY.replace("[2, 13]", "[-2, 13]"), ["samples.0.inclusion.size_mm", "-2.0", ">= 0.1"]),
+    "a negative size": (
+        STUDY.replace("[2, 13]", "[-2, 13]"),
+        ["samples.0.inclusion.size_mm", "-2.0", ">= 0.1"],
+    ),
     "no count": (STUDY.replace("count = 5", ""), ["samples.0.count", "nothing", "'uniform'"]),
     "count of none": (STUDY.replace("count = 5", "count = 0"), ["samples.0.count", "0", ">= 1"]),
     "too many": (STUDY.replace("count = 5", "count = 10000001"), ["samples.0.count", "10000001", "1e+07"]),
@@ -70,7 +76,10 @@ BAD = {
     "two groups of one name": (STUDY + STUDY[STUDY.index("[[samples]]") :], ["samples.1.name", "'box'"]),
     "a level of nothing": (STUDY.replace("[1, 2]", "[1, 0]"), ["indentation_mm.1", "0", ">= 0.0001"]),
     "no level": (STUDY.replace("[1, 2]", "[]"), ["indentation_mm", "[]", "1 to 100"]),
-    "unknown quality": (STUDY.replace("name =", 'quality = "best"\nname =', 1), ["quality", "'best'", "preview"]),
+    "unknown quality": (
+        STUDY.replace("name =", 'quality = "best"\nname =', 1),
+        ["quality", "'best'", "preview"],
+    ),
     "a negative seed": (STUDY.replace("name =", "seed = -1\nname =", 1), ["seed", "-1", ">= 0"]),
     "an emulator for nothing": (STUDY.replace("name =", 'emulator = "a.npz"\nname =', 1), ["emulator"]),
     "unknown distribution": (
@@ -174,7 +183,10 @@ IMPOSSIBLE = {
         STUDY.replace("[2, 13]", "[20, 22]").replace("[4, 12]", "[10, 12]"),
         ["samples.0", "draws cannot be simulated", "chest wall"],
     ),
-    "too deep a press": (STUDY.replace("[1, 2]", "[1, 7]"), ["study.toml: indentation_mm.1", "7.0", "<= 6 mm"]),
+    "too deep a press": (
+        STUDY.replace("[1, 2]", "[1, 7]"),
+        ["study.toml: indentation_mm.1", "7.0", "<= 6 mm"],
+    ),
     "no such design": (STUDY.replace("name =", 'design = "a.toml"\nname =', 1), ["DESIGN", "a.toml"]),
     "no such emulator": (STUDY.replace('"linear"', '"emulator"'), ["emulator", "tsis.npz", "twin emulate"]),
     "no such table": (

@@ -102,7 +102,10 @@ def projected(plan: Plan, cost: Cost, frames: int, workers: float) -> str:
             f"files {cost.write:.2f}), {cost.bytes / 1e6:.2f} MB; {cost.start:.0f} s once per worker",
         ),
         ("core hours", f"{core_seconds / 3600:.3g}"),
-        (f"{workers:g} workers", f"{_span(core_seconds / workers + cost.start)}, {60 * rate:.1f} samples a minute"),
+        (
+            f"{workers:g} workers",
+            f"{_span(core_seconds / workers + cost.start)}, {60 * rate:.1f} samples a minute",
+        ),
         ("storage", _size(size)),
         ("bandwidth", f"{_size(rate * cost.bytes)}/s written by {workers:g} workers"),
         (
