@@ -6,10 +6,10 @@ from importlib.resources import files
 import pytest
 
 from twin.complaint import DesignError
+from twin.design import load_design, parse_design
 from twin.fields import expand, put, tables_of
 from twin.plan import freeze
 from twin.study import PARAMETERS, Distribution, load_study, parse_study, shipped_studies
-from twin.design import load_design, parse_design
 
 STUDY = """
 kind = "corpus"

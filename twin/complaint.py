@@ -173,8 +173,9 @@ def _child(
     named = node.get("properties", {}).get(step)
     if named is not None:
         return named
-    # keys that are names of the user's own; false where there are none
-    return next(iter(node.get("patternProperties", {}).values()), node.get("additionalProperties") or None)
+    # keys that are names of the user's own; true or false where any or none may stand
+    own = next(iter(node.get("patternProperties", {}).values()), node.get("additionalProperties"))
+    return own if isinstance(own, Mapping) else None
 
 
 _BOUNDS = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}
