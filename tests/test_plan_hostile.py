@@ -22,6 +22,13 @@ def edit(folder, change):
     (folder / "plan.json").write_text(json.dumps(head))
 
 
+def nested(levels):
+    found = 1.0
+    for _ in range(levels):
+        found = {"x": found}
+    return found
+
+
 def rewrite(folder, change):
     """Change samples.parquet likewise."""
     table = change(pq.read_table(folder / "samples.parquet"))
@@ -66,6 +73,13 @@ HOSTILE = {
     "no JSON": (lambda f: (f / "plan.json").write_text("{"), ["not JSON"]),
     "bytes": (lambda f: (f / "plan.json").write_bytes(b"\xff\xfe"), ["not JSON"]),
     "nested deep": (lambda f: (f / "plan.json").write_text("[" * 100_000), ["not JSON"]),
+    "a nested design": (
+        lambda f: edit(f, lambda h: h["design"].update(glass=nested(300))), ["nested too deep"]),
+    "a design nested deeper": (
+        lambda f: edit(f, lambda h: h["design"].update(glass=nested(700))), ["nested too deep"]),
+    "a distribution without spread": (
+        lambda f: edit(f, lambda h: h["randomise"]["leds.*.flux_W"].pop("sd")), ["leds.*.flux_W.sd"]),
+    "a group elsewhere": (lambda f: edit(f, lambda h: h["groups"][0].update(name="../x")), ["groups.0.name"]),
     "a list": (lambda f: (f / "plan.json").write_text("[]"), ["the file"]),
     "a long number": (lambda f: (f / "plan.json").write_text('{"seed": ' + "9" * 9999 + "}"), ["not JSON"]),
     "another format": (head(format=2), ["format", "2"]),

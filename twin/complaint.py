@@ -178,6 +178,10 @@ def _child(
     return own if isinstance(own, Mapping) else None
 
 
+_PATTERNS = {
+    r"^[A-Za-z0-9][A-Za-z0-9_.-]*$": "a name of letters, digits, _ . and -, 100 characters at most",
+    r"^[0-9a-f]{64}$": "64 hexadecimal digits in quotes",
+}
 _BOUNDS = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}
 
 
@@ -195,6 +199,8 @@ def _in_words(schema: Mapping[str, Any], node: Mapping[str, Any] | None) -> str:
         case "number" | "integer" as kind:
             bounds = [f"{sign} {node[key]:g}" for key, sign in _BOUNDS.items() if key in node]
             return " ".join(["a number" if kind == "number" else "an integer", " and ".join(bounds)]).strip()
+        case "string" if node.get("pattern") in _PATTERNS:
+            return _PATTERNS[node["pattern"]]
         case "string":
             most = f" of 1 to {node['maxLength']} characters" if node.get("minLength") else ""
             return (
