@@ -155,7 +155,7 @@ class SCG(Optimizer):
         return bool(kept) and bool(kept["done"])
 
     @torch.no_grad()
-    def step(self, closure: Callable[[], Any]) -> Tensor:  # type: ignore[override]
+    def step(self, closure: Callable[[], Any]) -> Tensor:
         """One iteration; returns the loss at the weights that it leaves."""
         group = self.param_groups[0]
         params = group["params"]
