@@ -5,9 +5,9 @@ within 0 ... 2^bits - 1. The outcome k has the probability
 
     p_k = Φ((k + ½ - µ)/√v) - Φ((k - ½ - µ)/√v),   open to -∞ at k = 0 and to +∞ at the largest count,
 
-and Fisher's information about (µ, v) is the 2 x 2 matrix Σ_k ∂p_k ∂p_kᵀ / p_k (Kay 1993, equation 3.20;
+and Fisher's information about (µ, v) is the 2 x 2 matrix Σ_k ∂p_k ∂p_kᵀ / p_k (Kay 1993, section 3.7;
 [kay1993]). For √v well above a count it is that of a normal count with Sheppard's correction,
-1/(v + 1/12) (Widrow and Kollár 2008, sections 5.3 and 10.4; [widrow2008]); for √v well below one it is
+1/(v + 1/12) (Widrow and Kollár 2008, chapter 4; [widrow2008]); for √v well below one it is
 almost nothing, but for counts whose mean is near the threshold between two numbers.
 """
 

@@ -1,5 +1,9 @@
 """Fisher's information and bounds: closed forms, sampled pictures, and what must hold for any of them."""
 
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.special import ndtr
@@ -304,3 +308,12 @@ def test_mistakes_are_refused_in_one_line(call, word):
     with pytest.raises(ValueError, match=word) as caught:
         call()
     assert "\n" not in str(caught.value)
+
+
+def test_the_room_is_light():
+    """`import estimation` loads neither torch nor scipy; every public name is found without torch."""
+    code = (
+        "import sys, estimation as e; assert not {'torch', 'scipy'} & set(sys.modules); "
+        "[getattr(e, n) for n in e.__all__]; assert 'torch' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parent.parent)
