@@ -137,7 +137,7 @@ def fisher(jacobian: ArrayLike, weight: ArrayLike) -> Floats:
 def inform(
     names: Sequence[str],
     pictures: Iterable[tuple[ArrayLike, ArrayLike, Noise]],
-    prior_sd: Sequence[float] | None = None,
+    prior: ArrayLike | None = None,
 ) -> Information:
     """What independent pictures tell together about the same parameters.
 
@@ -146,7 +146,8 @@ def inform(
     names : of the p parameters, wanted ones and nuisances.
     pictures : (jacobian, mean, noise) of each: counts per unit (p, ...), counts (...), and its camera. A
         reference picture without inclusion is one more, whose Jacobian is zero for the inclusion.
-    prior_sd : (p,) standard deviations of normal priors, in each parameter's unit; inf where none.
+    prior : of normal prior knowledge, (p,) standard deviations in each parameter's unit, inf where none, or
+        the (p, p) precision matrix. Without, none.
     """
     named = tuple(names)
     total = np.zeros((len(named), len(named)))
@@ -155,15 +156,25 @@ def inform(
         if one.shape != total.shape:
             raise ValueError(f"jacobian: received {len(one)} parameters; allowed {len(named)}: {named}")
         total += one
-    return Information(named, total, precision([np.inf] * len(named) if prior_sd is None else prior_sd))
+    known = precision(np.full(len(named), np.inf) if prior is None else prior)
+    if known.shape != total.shape:
+        raise ValueError(f"prior: received {len(known)} parameters; allowed {len(named)}: {named}")
+    return Information(named, total, known)
 
 
-def precision(prior_sd: Sequence[float]) -> Floats:
-    """Diagonal precision matrix (p, p) of independent normal priors; inf is no prior."""
-    sd = np.asarray(prior_sd, np.float64)
-    if sd.ndim != 1 or not (sd > 0).all():
-        raise ValueError(f"prior_sd: received {prior_sd!r}; allowed numbers > 0, inf for none")
-    return np.diag(1.0 / sd**2)
+def precision(prior: ArrayLike) -> Floats:
+    """Precision matrix (p, p) of independent priors with these sd (p,), inf for none; or itself, checked."""
+    given = np.asarray(prior, np.float64)
+    if given.ndim == 1 and (given > 0).all():
+        return np.diag(1.0 / given**2)
+    if given.ndim == 2 and np.isfinite(given).all() and given.shape == given.T.shape:
+        least = np.linalg.eigvalsh(given).min() if np.allclose(given, given.T, rtol=1e-9) else -np.inf
+        if least >= -_NULL * np.abs(given).max():
+            return given
+    allowed = (
+        "standard deviations > 0, inf for none, or a symmetric precision matrix without negative eigenvalues"
+    )
+    raise ValueError(f"prior: received {given.tolist()}; allowed {allowed}")
 
 
 def bound(

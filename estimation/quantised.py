@@ -24,7 +24,7 @@ Floats = NDArray[np.float64]
 
 _REACH = 8.0  # standard deviations that are summed over: what lies beyond holds 1e-13 of the information
 _SMOOTH = 2.0  # counts; above, rounding is uniform noise but for exp(-2π²v) = 5e-35
-_BLOCK = 2_000_000  # outcomes at a time
+_BLOCK = 100_000  # outcomes at a time, which stay in the cache
 _LEAST = 1e-300  # chance below which an outcome does not count
 _FAR = 40.0  # standard deviations that stand for infinity: the density underflows
 

@@ -128,6 +128,18 @@ def test_linear_model_with_normal_noise_is_least_squares():
     assert bound(told, ["c", "a"]).covariance == pytest.approx(ridge[np.ix_([2, 0], [2, 0])])
 
 
+def test_a_correlated_prior_is_taken_as_its_precision():
+    """Two parameters whose sum alone is seen: the bound is that of the conditioned normal distribution."""
+    covariance, sd = np.array([[4.0, 1.5], [1.5, 1.0]]), 0.5
+    jacobian = np.ones((2, 1))
+    told = inform("ab", [(jacobian, [50.0], Noise(0.0, sd, bits=None))], np.linalg.inv(covariance))
+    gain = covariance.sum(axis=1) / (covariance.sum() + sd**2)
+    assert bound(told).covariance == pytest.approx(covariance - np.outer(gain, covariance.sum(axis=0)))
+    tighter = with_prior(told, "a", 0.1)
+    scaled = covariance * np.outer([0.1, 1], [0.1, 1])
+    assert tighter.prior == pytest.approx(np.linalg.inv(scaled))
+
+
 def test_shot_noise_tells_about_its_mean():
     """Kay 1993, equation 3.31 for one mean: 1/v + K²/(2 v²)."""
     noise = Noise(shot=0.5, read_dn=0.2, offset_dn=3.0, bits=None)
@@ -299,7 +311,9 @@ def test_area_of_the_ideal_observer():
         (lambda: Noise(shot=-1.0, read_dn=0.1), "shot"),
         (lambda: Noise(shot=0.1, read_dn=0.1, frames=0), "frames"),
         (lambda: fisher(np.ones((2, 5)), np.ones(4)), "jacobian"),
-        (lambda: precision([1.0, 0.0]), "prior_sd"),
+        (lambda: precision([1.0, 0.0]), "prior"),
+        (lambda: precision([[1.0, 2.0], [2.0, 1.0]]), "prior"),
+        (lambda: inform("ab", [], [1.0]), "prior"),
         (lambda: bound(Information(("a",), np.eye(1), np.eye(1)), ["b"]), "wanted"),
         (lambda: with_prior(Information(("a",), np.eye(1), np.eye(1)), "a", 0.0), "factor"),
     ],
