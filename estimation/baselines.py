@@ -1,9 +1,10 @@
 """The methods before the paper: a Gaussian fitted to the picture, inverted through a table of 2-D solutions.
 
 The paper's introduction ([lee2011]) names them: "2-dimensional finite element method based forward
-algorithm and Gaussian fitting model-based inversion algorithms" (its reference 9), extended to more inclusions
-(10), for inclusions at least 100 times as stiff as the tissue, and a network trained on few 2-D solutions (11),
-which is `estimation.ann` with another table. It gives no details; what stands here is the plainest reading:
+algorithm and Gaussian fitting model-based inversion algorithms" (its reference 9), extended to more
+inclusions (10), for inclusions at least 100 times as stiff as the tissue, and a network trained on few 2-D
+solutions (11), which is `estimation.ann` with another table. It gives no details; what stands here is the
+plainest reading:
 
 - a bump A exp(-r²/2s²) over a slanted background is fitted to the tared picture (`fit_bump`), or to a line
   of displacements (`fit_profile`);
