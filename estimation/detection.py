@@ -29,15 +29,17 @@ def signal_weight(mean_0: ArrayLike, mean_1: ArrayLike, noise: Noise) -> Floats:
     ----------
     mean_0, mean_1 : (...) counts without and with the signal.
     """
-    before, after = np.asarray(mean_0, np.float64), np.asarray(mean_1, np.float64)
-    weight = np.array(pixel_information((before + after) / 2.0, noise))
+    before, after = np.broadcast_arrays(np.asarray(mean_0, np.float64), np.asarray(mean_1, np.float64))
+    middle = (before + after) / 2.0
+    weight = np.array(pixel_information(middle, noise))
+    light = np.maximum(middle - noise.offset_dn, 0.0)
+    fixed = noise.fixed_dn**2 + (noise.fixed_share * light) ** 2
     apart = np.abs(after - before) > 1e-4
     before, after = before[apart], after[apart]
     spread = mean_variance(before, noise), mean_variance(after, noise)
     told = noise.frames * count_divergence(before, spread[0], after, spread[1], noise.bits)
     told /= (after - before) ** 2
-    light = np.maximum((before + after) / 2.0 - noise.offset_dn, 0.0)
-    weight[apart] = told / (1.0 + told * (noise.fixed_dn**2 + (noise.fixed_share * light) ** 2))
+    weight[apart] = told / (1.0 + told * fixed[apart])
     return weight
 
 

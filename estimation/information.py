@@ -39,7 +39,9 @@ class Noise:
     bits : of the converter, which rounds and clips to 0 ... 2^bits - 1; None if it does neither.
     frames : exposures of the same scene that are averaged; each is rounded by itself.
     fixed_dn, fixed_share : standard deviation, per pixel, of what no averaging takes away (fixed pattern,
-        model error), in counts and as a share of the light; both are independent from pixel to pixel.
+        model error), in counts and as a share of the light; both are independent from pixel to pixel, and
+        `fixed_dn` may be an array like the picture. Taring leaves of a camera's fixed pattern its PRNU times
+        the tared signal.
     """
 
     shot: float
@@ -47,14 +49,14 @@ class Noise:
     offset_dn: float = 0.0
     bits: int | None = 8
     frames: int = 1
-    fixed_dn: float = 0.0
+    fixed_dn: float | Floats = 0.0
     fixed_share: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("shot", "read_dn", "fixed_dn", "fixed_share"):
-            value = getattr(self, name)
-            if not 0 <= value < np.inf:
-                raise ValueError(f"{name}: received {value!r}; allowed a number >= 0")
+            value = np.asarray(getattr(self, name))
+            if not ((value >= 0) & (value < np.inf)).all():
+                raise ValueError(f"{name}: received {value.min():g}; allowed finite numbers >= 0")
         if self.frames < 1:
             raise ValueError(f"frames: received {self.frames!r}; allowed 1 or more")
 
