@@ -13,7 +13,8 @@ Nothing here knows what inputs mean: logarithms, where they help, are the caller
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 
@@ -130,10 +131,11 @@ def train(
         )
     sizes = (x.shape[1], *settings.hidden, y.shape[1])
     members = [(f, r) for f in folds for r in range(repeats)]
-    parts = [
-        _train_block(x, y, members[i : i + _BLOCK], seed, sizes, settings)
-        for i in range(0, len(members), _BLOCK)
-    ]
+    with _one_thread():
+        parts = [
+            _train_block(x, y, members[i : i + _BLOCK], seed, sizes, settings)
+            for i in range(0, len(members), _BLOCK)
+        ]
     joined = {
         field.name: np.concatenate([getattr(part, field.name) for part in parts])
         for field in fields(Ensemble)[1:]
@@ -190,6 +192,17 @@ class _Best:
     fit: Tensor
     check: Tensor
     steps: Tensor
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """The arrays are small: a second thread gains a third on an idle core and costs 5 times on a busy one."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def _train_block(
