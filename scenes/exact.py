@@ -18,6 +18,7 @@ from scipy.ndimage import map_coordinates
 
 from . import trace, wander
 from .bsdf import Table
+from .faces import CONTACT, NOTHING, Faces
 from .sensor import Sensor
 from .view import PixelRays
 
@@ -154,14 +155,14 @@ def exact(
     films = [Film.at(sensor, rays, height) for height in (0.0, mirrored_run_mm(sensor))]
     views = [_View.of(film, sensor) for film in films]
     contact = next(shape for shape in scene.shapes() if shape.id() == "contact")
-    named = {shape.id(): mi.ShapePtr(shape) for shape in scene.shapes()}
+    faces = Faces(scene, sensor)
     context = mi.BSDFContext(mi.TransportMode.Importance)
     spots = mi.Texture2f(mi.TensorXf(fraction[..., None].astype(np.float32)), wrap_mode=dr.WrapMode.Clamp)
     squeezed = (sensor.guide.refractive_index / sensor.tissue.refractive_index) ** 2
 
     index = dr.arange(mi.UInt32, n_led * samples)
     number = index // mi.UInt32(dr.opaque(mi.UInt32, samples))
-    place = index - number * dr.opaque(mi.UInt32, samples)
+    place = trace.side_by_side(samples, n_led)
     starts = np.random.Generator(np.random.Philox(seed)).integers(0, 2**32, size=4)
     sequence = dr.arange(mi.UInt64, n_led * samples) + 1
     random = mi.PCG32(size=n_led * samples, initstate=dr.opaque(mi.UInt64, seed), initseq=sequence)
@@ -170,43 +171,41 @@ def exact(
         return alive
 
     def step(ray, throughput, bounce, alive, random):  # type: ignore[no-untyped-def]
-        si = scene.ray_intersect(ray, alive)
-        for lost in trace.absorb(sensor, ray, si, throughput, alive).values():
+        met = faces.meet(ray, alive)
+        for lost in trace.absorb(sensor, ray, met, throughput).values():
             throughput = throughput - lost
-        alive &= si.is_valid()
-        cosine = mi.Frame3f.cos_theta(si.wi)
-        touches = alive & (si.shape == mi.ShapePtr(contact)) & (cosine > 0.0)
-        a = contact.eval_attribute_1("vertex_contact_fraction", si, touches)
-        a = dr.select(dr.isfinite(a), a, 0.0)  # slivers at a pressed-back rim
+        alive = alive & (met.kind != NOTHING)
+        touches = alive & (met.kind == CONTACT) & (met.cosine > 0.0)
         u1, u2 = random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32())
-        direction, share, _ = trace.bounce_off(sensor, named, ray, si, alive & ~touches, u1, u2)
-        through = table.transmittance(a, cosine, touches)
+        direction, share = trace.bounce_off(sensor, faces, met, alive & ~touches, u1, u2)
+        through = table.transmittance(met.fraction, met.cosine, touches)
         if local:
             # what leaves towards the camera is known before it is drawn
             glow = throughput * through * dr.inv_pi
             for view in views:
-                down = view.towards(si.p)
-                off = dr.dot(si.sh_frame.n, down)
+                down = view.towards(met.p)
+                off = dr.dot(met.normal, down)
                 off_unit = off * dr.rcp(dr.norm(down))
-                seen = table.transmittance(a, off_unit, touches) * table.diffuse(a, cosine, off_unit, touches)
-                view.add(number, si.p, glow * seen * dr.dot(si.n, down), touches & (off > 0.0))
+                seen = table.transmittance(met.fraction, off_unit, touches)
+                seen *= table.diffuse(met.fraction, met.cosine, off_unit, touches)
+                view.add(number, met.p, glow * seen * dr.dot(met.n, down), touches & (off > 0.0))
+            si = scene.ray_intersect(ray, touches)
             scattered, weight = si.bsdf(ray).sample(context, si, u1, u2, touches)
-            direction = dr.select(touches, scattered.wo, direction)
+            direction = dr.select(touches, si.to_world(scattered.wo), direction)
             share = dr.select(touches, weight[0], share)
-            following = si.spawn_ray(si.to_world(direction))
+            following = met.leaving(direction)
         else:
-            direction = dr.select(touches, mi.reflect(si.wi), direction)
+            following = met.leaving(dr.select(touches, met.mirrored, direction))
             share = dr.select(touches, 1.0, share)
-            following = si.spawn_ray(si.to_world(direction))
             enters = touches & (u1 < through)
             back, left, random = wander.wander(
-                sensor, table, spots, views, si, number, throughput, enters, random
+                sensor, table, spots, views, met, number, throughput, enters, random
             )
             share = dr.select(enters, left, share)
             following = dr.select(enters, _come_back(scene, contact, back), following)
         kept = throughput * share
         survive = dr.select(bounce < _SURE_BOUNCES, 1.0, dr.minimum(kept, 0.95))
-        alive &= (kept > 0.0) & (random.next_float32() < survive) & (bounce < _MAX_BOUNCES)
+        alive = alive & (kept > 0.0) & (random.next_float32() < survive) & (bounce < _MAX_BOUNCES)
         return following, dr.select(alive, kept / survive, 0.0), bounce + 1, alive, random
 
     begin = (trace.emit(sensor, number, trace.evenly(place, starts)), dr.full(mi.Float, 1.0, n_led * samples))

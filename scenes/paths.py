@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from . import trace
 from .bsdf import Table
+from .faces import CONTACT, LED, NOTHING, WALL, Faces
 from .sensor import Sensor
 from .view import PixelRays
 
@@ -96,8 +97,7 @@ def record(
     """
     lanes = dr.width(number)
     shapes = {shape.id(): mi.ShapePtr(shape) for shape in scene.shapes()}
-    names = tuple(shapes)
-    contact = next(shape for shape in scene.shapes() if shape.id() == "contact")
+    names, faces_of = tuple(shapes), Faces(scene, sensor)
     sequence = dr.arange(mi.UInt64, lanes) + 1
     random = mi.PCG32(size=lanes, initstate=dr.opaque(mi.UInt64, seed), initseq=sequence)
     alive, inside = dr.full(mi.Bool, True, lanes), dr.full(mi.Bool, False, lanes)
@@ -106,7 +106,7 @@ def record(
     dr.make_opaque(ray, alive, inside, fate, first)
     corners, faces = [_numpy(ray.o)], []
     for _ in range(bounces):
-        step = _step(scene, sensor, table, contact, shapes, ray, alive, inside, fate, random)
+        step = _step(faces_of, sensor, table, shapes, ray, alive, inside, fate, random)
         ray, alive, inside, fate, corner, face, cosine = step
         first = dr.select(dr.isnan(first), cosine, first)
         dr.eval(ray, alive, inside, fate, first, corner, face, random)
@@ -140,10 +140,9 @@ def in_sight(scene: mi.Scene, sensor: Sensor, rays: PixelRays) -> NDArray[np.flo
 
 
 def _step(  # type: ignore[no-untyped-def]
-    scene: mi.Scene,
+    of: Faces,
     sensor: Sensor,
     table: Table,
-    contact: mi.Mesh,
     shapes: dict[str, mi.ShapePtr],
     ray: mi.Ray3f,
     alive: mi.Bool,
@@ -153,8 +152,8 @@ def _step(  # type: ignore[no-untyped-def]
 ):
     """One straight run and what happens at its end; see `trace.walk` for the laws."""
     before = alive
-    si = scene.ray_intersect(ray, alive)
-    met = alive & si.is_valid()
+    here = of.meet(ray, alive)
+    met = here.kind != NOTHING
     u = [random.next_float32() for _ in range(5)]
 
     def end(where: mi.Bool, name: str) -> None:
@@ -163,49 +162,43 @@ def _step(  # type: ignore[no-untyped-def]
         alive = alive & ~where
 
     down = ray.o.z < -sensor.guide.thickness_mm
-    gone = alive & ~si.is_valid()
+    gone = alive & ~met
     end(gone & down, "below")
     end(gone & inside, "aside")
     end(gone, "missed")
-    corner = dr.select(gone, ray.o + _AWAY_MM * ray.d, si.p)
+    corner = dr.select(gone, ray.o + _AWAY_MM * ray.d, here.p)
 
     # absorbed on the way, in proportion to what `trace` takes there
-    lost = trace.absorb(sensor, ray, si, mi.Float(1.0), met)
+    lost = trace.absorb(sensor, ray, here, mi.Float(1.0))
     left = 1.0 - sum(lost.values(), mi.Float(0.0))
     absorbed = met & (u[0] >= left)
-    run = si.t * dr.log(dr.maximum(u[0], 1e-30)) / dr.minimum(dr.log(dr.maximum(left, 1e-30)), -1e-12)
+    run = here.t * dr.log(dr.maximum(u[0], 1e-30)) / dr.minimum(dr.log(dr.maximum(left, 1e-30)), -1e-12)
     corner = dr.select(absorbed, ray.o + run * ray.d, corner)
     for name, part in lost.items():
         end(absorbed & (part > 0.0), name)
 
     half = sensor.guide.width_mm / 2
-    middle = ray.o + 0.5 * si.t * ray.d
+    middle = ray.o + 0.5 * here.t * ray.d
     within = dr.maximum(dr.abs(middle.x), dr.abs(middle.y)) < half
     inside |= met & within & (middle.z > -sensor.guide.thickness_mm)
 
-    cosine = mi.Frame3f.cos_theta(si.wi)
-    on_contact = met & alive & (si.shape == mi.ShapePtr(contact)) & (cosine > 0.0)
-    fraction = contact.eval_attribute_1("vertex_contact_fraction", si, on_contact)
-    fraction = dr.select(dr.isfinite(fraction), fraction, 0.0)
-    end(on_contact & (u[1] < table.transmittance(fraction, cosine, on_contact)), "tissue")
+    on_contact = met & alive & (here.kind == CONTACT) & (here.cosine > 0.0)
+    end(on_contact & (u[1] < table.transmittance(here.fraction, here.cosine, on_contact)), "tissue")
 
     elsewhere = met & ~on_contact
-    direction, kept, on_wall = trace.bounce_off(
-        sensor, shapes, ray, si, elsewhere, u[2], mi.Point2f(u[3], u[4])
-    )
-    direction = dr.select(on_contact, mi.reflect(si.wi), direction)
+    direction, kept = trace.bounce_off(sensor, of, here, elsewhere, u[2], mi.Point2f(u[3], u[4]))
+    direction = dr.select(on_contact, here.mirrored, direction)
     stops = elsewhere & (random.next_float32() >= kept)
-    end(stops & trace.one_of(si.shape, shapes, "led_"), "leds")
-    end(stops & on_wall, "walls")
+    end(stops & (here.kind == LED), "leds")
+    end(stops & (here.kind == WALL), "walls")
     end(stops, "frame")
 
     face = mi.UInt32(0)
     for number, shape in enumerate(shapes.values()):
-        face = dr.select(met & ~absorbed & (si.shape == shape), mi.UInt32(number + 1), face)
+        face = dr.select(met & ~absorbed & (here.shape == shape), mi.UInt32(number + 1), face)
     corner = dr.select(before, corner, mi.Point3f(dr.nan))
-    following = si.spawn_ray(si.to_world(direction))
-    ray = dr.select(alive, following, ray)
-    return ray, alive, inside, fate, corner, face, dr.select(on_contact, cosine, dr.nan)
+    ray = dr.select(alive, here.leaving(direction), ray)
+    return ray, alive, inside, fate, corner, face, dr.select(on_contact, here.cosine, dr.nan)
 
 
 def _numpy(points: mi.Point3f) -> NDArray[np.float32]:

@@ -26,7 +26,7 @@ Quality = Literal["preview", "standard", "reference"]
 PATHS_PER_LED = {"preview": 2**17, "standard": 2**20, "reference": 2**24}
 """Light paths that the qualities spend on each LED."""
 
-_PATHS_PER_PASS = 2**20  # of all LEDs; independent passes bound the memory and tell the noise
+_PATHS_PER_PASS = 2**21  # of all LEDs; independent passes bound the memory and tell the noise
 _LEAST_PASSES = 2
 _MOST_PASSES = 2**14  # so that seeds of passes do not meet
 

@@ -118,8 +118,7 @@ def transport(
     def walk(order: int, each: int, upward: Array | None) -> tuple[Array, Array, Array, Array]:
         index = dr.arange(mi.UInt32, n_led * each)
         number = index // mi.UInt32(dr.opaque(mi.UInt32, each))
-        place = index - number * dr.opaque(mi.UInt32, each)
-        u = trace.evenly(place, starts[order])
+        u = trace.evenly(trace.side_by_side(each, n_led), starts[order])
         if upward is None:
             legs = [_first_leg(led) for led in sensor.leds]
             leg = dr.gather(mi.UInt32, mi.UInt32(np.array(legs, dtype=np.uint32)), number)

@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .bsdf import Table
+from .faces import Meeting
 from .sensor import Sensor
 from .walk import Body, Medium, roam
 
@@ -44,25 +45,26 @@ def wander(
     table: Table,
     spots: mi.Texture2f,
     views: Sequence[View],
-    si: mi.SurfaceInteraction3f,
+    met: Meeting,
     number: mi.UInt32,
     throughput: mi.Float,
     enters: mi.Bool,
     random: mi.PCG32,
 ) -> tuple[mi.Ray3f, mi.Float, mi.PCG32]:
-    """Follow light that enters at `si` until it leaves, and show it to the views at every collision.
+    """Follow light that enters where it `met` the contact until it leaves; views see every collision.
 
     Returns
     -------
-    The ray that leaves (in the guide, from the plane through `si`), the share of the light that it carries,
+    The ray that leaves (in the guide, from the plane through there), the share of the light that it carries,
     0 where all is absorbed, and the state of the random numbers.
     """
     body, width = body_of(sensor), sensor.guide.width_mm
     index = sensor.guide.refractive_index / behind(sensor)
-    frame = si.sh_frame
+    frame = mi.Frame3f(met.normal)
+    here = frame.to_local(met.d)
 
     def world(place: mi.Point3f) -> mi.Point3f:
-        return si.p + frame.to_world(mi.Vector3f(place.x, place.y, -place.z))
+        return met.p + frame.to_world(mi.Vector3f(place.x, place.y, -place.z))
 
     def fraction_at(point: mi.Point3f) -> mi.Float:
         return spots.eval(mi.Point2f(point.x / width + 0.5, point.y / width + 0.5))[0]
@@ -86,7 +88,7 @@ def wander(
             amount = throughput * share * bend * dr.exp(-body.medium.extinction_per_mm * run) / up
             view.add(number, leaves, amount * seen, collides & (out.z > 0.0) & (up > 0.0))
 
-    flat = -mi.Vector2f(si.wi.x, si.wi.y) * index
+    flat = mi.Vector2f(here.x, here.y) * index
     way = mi.Vector3f(flat.x, flat.y, dr.safe_sqrt(1.0 - dr.squared_norm(flat)))
     start = dr.zeros(mi.Point3f, dr.width(number))
     where, way, share, _, random = roam(body, start, way, random, passing, enters, witness)

@@ -44,8 +44,12 @@ def _plan(arguments: argparse.Namespace) -> int:
     print(described(plan), flush=True)
     if arguments.no_probe:
         return 0
-    with Reporter() as report:
-        cost = measure(plan, tell)
+    try:
+        with Reporter() as report:
+            cost = measure(plan, tell)
+    except KeyboardInterrupt:
+        print("twin corpus plan: interrupted in the probe; the plan is written", file=sys.stderr)
+        return 130
     print(projected(plan, cost, len(plan) * len(plan.indentation_mm), arguments.workers))
     if arguments.frames is not None:
         print(projected(plan, cost, arguments.frames, arguments.workers))
