@@ -6,7 +6,7 @@ import logging
 import os
 import signal
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
 from twin.complaint import DesignError, shown
@@ -41,12 +41,13 @@ def crew(workers: int | None, scheduler: str | None) -> Iterator[Client]:
     DesignError
         If no scheduler answers under the address.
     """
-    # Before Dask is imported, here and in its workers: it tells a terminal a lot that is no news to a user.
-    os.environ[QUIET] = "CRITICAL"
-    import dask
-    from distributed import Client
+    with ExitStack() as stack:
+        # Before Dask is imported, here and in workers: it tells a terminal a lot that is no news to a user.
+        stack.enter_context(_environment(QUIET, "CRITICAL"))
+        import dask
+        from distributed import Client
 
-    with dask.config.set(_QUIET):
+        stack.enter_context(dask.config.set(_QUIET))
         for name in ("distributed", "tornado.application", "asyncio"):
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)
         if scheduler is not None:
@@ -55,6 +56,18 @@ def crew(workers: int | None, scheduler: str | None) -> Iterator[Client]:
             return
         with _local(workers or cores()) as cluster, Client(cluster, set_as_default=False) as client:
             yield client
+
+
+@contextmanager
+def _environment(name: str, value: str) -> Iterator[None]:
+    before = os.environ.get(name)
+    os.environ[name] = value
+    try:
+        yield
+    finally:
+        del os.environ[name]
+        if before is not None:
+            os.environ[name] = before
 
 
 def cores() -> int:
