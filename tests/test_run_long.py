@@ -164,6 +164,22 @@ def test_one_of_two_workers_is_killed_in_the_middle(undisturbed, tmp_path):
         assert same(corpus, undisturbed)
 
 
+def test_a_scheduler_that_is_gone_stops_the_run(undisturbed, tmp_path):
+    """And costs no sample its retry: none is recorded as failed, and another run makes the rest."""
+    corpus = only_plan(undisturbed, tmp_path / "c")
+    with cluster(1) as (address, _):
+        process = start(corpus, "--scheduler", address)
+        while not store.finished(corpus) and process.poll() is None:
+            time.sleep(0.1)
+    _, err = process.communicate(timeout=120)
+    assert process.returncode == 1
+    assert err.splitlines()[-1].startswith("twin corpus run: the scheduler is gone")
+    assert "Traceback" not in err
+    assert not (corpus / "failed").exists()
+    run.run(corpus, 2)
+    assert same(corpus, undisturbed)
+
+
 def test_a_local_worker_is_killed_in_the_middle(undisturbed, tmp_path):
     import psutil
 

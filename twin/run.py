@@ -14,6 +14,7 @@ import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import CancelledError
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -193,10 +194,21 @@ class _Run:
                     self.state.count()
                 elif outcome.stops:
                     raise Stopped(outcome.error)
+                elif outcome is _LOST and self._was_away():
+                    again.append((number, attempt))
                 elif attempt < self.retries:
                     again.append((number, attempt + 1))
                 else:
                     self._record(number, attempt + 1, outcome)
+
+    def _was_away(self) -> bool:
+        """Wait for a scheduler that does not answer; return whether there was one to wait for."""
+        away = False
+        while self.client.status != "running":
+            away = True
+            self._look()
+            time.sleep(_TICK_S)
+        return away
 
     def _start(self, number: int, attempt: int) -> None:
         name = f"{self.run_id}-{number}-{attempt}"
@@ -267,6 +279,9 @@ class _Run:
         self.state.failed += 1
 
 
+_LOST = Trouble("the scheduler forgot it")
+
+
 def _chained(first: int, rest: Iterator[int]) -> Iterator[int]:
     yield first
     yield from rest
@@ -278,6 +293,8 @@ def _outcome(future: Future) -> Any:
         return future.result()
     except (Exception, asyncio.CancelledError) as error:
         name = type(error).__name__
+        if isinstance(error, asyncio.CancelledError | CancelledError):
+            return _LOST
         if name == "KilledWorker":
             return Trouble("KilledWorker: every worker that tried it died", traceback.format_exc())
         if isinstance(error, ImportError):
