@@ -154,6 +154,20 @@ def test_one_run_at_a_time(finished_corpus, tmp_path, capsys):
     assert is_tidy(corpus)
 
 
+@pytest.mark.parametrize("name", ["samples", "samples/000", "references", "failed"])
+def test_a_corpus_that_leads_elsewhere_is_refused(finished_corpus, tmp_path, name, capsys):
+    corpus, elsewhere = copy_of(finished_corpus, tmp_path / "c"), tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / ".precious.part").touch()
+    shutil.rmtree(corpus / name, ignore_errors=True)
+    (corpus / name).symlink_to(elsewhere)
+    for action in (["run"], ["verify", "--repair"]):
+        assert main(["corpus", *action, str(corpus)]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert f"DIR: received '{name}', which is a link" in line
+    assert [path.name for path in elsewhere.iterdir()] == [".precious.part"]
+
+
 def test_a_scheduler_that_does_not_answer_is_refused(finished_corpus, tmp_path, monkeypatch, capsys):
     corpus = only_plan(finished_corpus, tmp_path / "c")
     monkeypatch.setattr(crew, "ANSWER_S", 1.0)

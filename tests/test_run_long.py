@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 from corpora import freeze_tiny, hashes, make_up_emulator
-from test_run import ROOT, all_gone, cut_off, is_tidy, only_plan, start
+from test_run import ROOT, all_gone, cut_off, is_tidy, only_plan, parts, start
 
 from twin import index, run, store
 from twin.plan import load_plan
@@ -85,19 +85,20 @@ def test_kill_9_at_ten_random_moments(undisturbed, tmp_path):
     corpus = only_plan(undisturbed, tmp_path / "c")
     moments = random.Random(5)
     left = 0
-    for _ in range(10):
-        # A start takes four seconds; a sample of two levels two to four.
-        process, wait_s = start(corpus), moments.uniform(0.5, 12.0)
-        with pytest.raises(subprocess.TimeoutExpired):
-            process.wait(timeout=wait_s)
+    for kill in range(10):
+        if len(store.finished(corpus)) > COUNT - 4:  # or there would be nothing left to interrupt
+            for number in sorted(store.finished(corpus))[:6]:
+                shutil.rmtree(store.sample_folder(corpus, number))
+        before = store.finished(corpus)
+        # Some while it starts, most while samples are being made: two at a time, a second or two each.
+        at_work = kill % 5 != 0
+        process = cut_off(corpus, 0, lambda: not at_work or parts(corpus) or store.finished(corpus) != before)
+        time.sleep(moments.uniform(0.0, 3.0))
+        assert process.poll() is None
         process.send_signal(signal.SIGKILL)
         process.communicate()
         assert all_gone(process.pid)  # its workers went with it
-        left += bool(list(corpus.rglob(".*.part")))
-        done = len(store.finished(corpus))
-        if done >= COUNT - 2:  # or there would be nothing to kill any more
-            for number in list(store.finished(corpus))[:6]:
-                shutil.rmtree(store.sample_folder(corpus, number))
+        left += bool(parts(corpus))
     assert left  # some of them were in the middle of a sample
     process = start(corpus)
     out, err = process.communicate(timeout=300)

@@ -36,7 +36,8 @@ _UNWRITABLE = FULL | {errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.E
 QUIET = "DASK_LOGGING__DISTRIBUTED"
 """Environment variable: the level from which Dask logs, when set before Dask is imported."""
 FRAMES_PER_LIFE = 6000
-"""Frames after which a worker is replaced, whatever it holds."""
+"""Frames after which a worker is replaced, whatever it holds; TWIN_FRAMES_PER_WORKER in its environment is
+another number."""
 YOUNG_FRAMES, MOST_GROWTH, SPARE_B = 50, 1.5, 256 * 2**20
 """A worker is replaced too when it holds so many times what it held after its first frames, and some."""
 

@@ -81,6 +81,15 @@ def holder(corpus: Path) -> str | None:
         os.close(handle)
 
 
+def refuse_links(corpus: Path) -> None:
+    """Raise `DesignError` if a folder that a run writes into is a link: a stranger's could lead anywhere."""
+    for place in ("samples", "samples/*", "references", "failed"):
+        for path in corpus.glob(place):
+            if path.is_symlink() or not path.is_dir():
+                received = f"{shown(path.relative_to(corpus).as_posix())}, which is a link or a file"
+                raise DesignError("DIR", received, "a corpus whose folders are folders")
+
+
 def leftovers(corpus: Path) -> list[Path]:
     """Return the temporary files and folders that lie in a corpus: of its run, or of one that was killed."""
     return sorted(

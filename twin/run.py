@@ -25,7 +25,7 @@ from twin import index, interrupt, labour, store
 from twin.complaint import DesignError, shown
 from twin.crew import crew
 from twin.labour import Corpus, Made, Trouble
-from twin.occupied import locked, sweep
+from twin.occupied import locked, refuse_links, sweep
 from twin.plan import load_plan
 from twin.planned import PLAN
 
@@ -116,6 +116,7 @@ def run(
     tell = progress or (lambda state: None)
     try:
         with locked(folder):
+            refuse_links(folder)
             sweep(folder)
             there = store.finished(folder)
             wanted = _checked(plan, numbers)

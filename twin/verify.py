@@ -101,6 +101,7 @@ def verify(
     with ExitStack() as stack:
         if repair:
             stack.enter_context(occupied.locked(folder))
+            occupied.refuse_links(folder)
         try:
             plan = load_plan(folder)
         except DesignError as error:
