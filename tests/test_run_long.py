@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -80,6 +81,11 @@ def test_the_index_is_the_same_but_for_its_timings(undisturbed, tmp_path):
     assert (again / index.FILE).read_bytes() == before
 
 
+def has_begun(corpus: Path, before: set[int]) -> bool:
+    """Whether a sample is being made, or was finished since."""
+    return bool(parts(corpus)) or store.finished(corpus) != before
+
+
 def test_kill_9_at_ten_random_moments(undisturbed, tmp_path):
     """Each time on what the kill before left; the last run is let be."""
     corpus = only_plan(undisturbed, tmp_path / "c")
@@ -92,7 +98,7 @@ def test_kill_9_at_ten_random_moments(undisturbed, tmp_path):
         before = store.finished(corpus)
         # Some while it starts, most while samples are being made: two at a time, a second or two each.
         at_work = kill % 5 != 0
-        process = cut_off(corpus, 0, lambda: not at_work or parts(corpus) or store.finished(corpus) != before)
+        process = cut_off(corpus, 0, partial(has_begun, corpus, before) if at_work else lambda: True)
         time.sleep(moments.uniform(0.0, 3.0))
         assert process.poll() is None
         process.send_signal(signal.SIGKILL)

@@ -11,7 +11,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from corpora import freeze_tiny
+from corpora import freeze_tiny, make_up_emulator
 
 from twin import crew, labour, run
 from twin.labour import Made
@@ -47,10 +47,11 @@ def test_two_workers_are_twice_as_fast(tmp_path):
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 def test_a_workers_memory_stays(tmp_path, monkeypatch):
-    """After 500 frames within 10 % of that after 50, of a worker that is never replaced."""
+    """After 500 frames within 10 % of that after 50, of a worker that is never replaced; emulated."""
     monkeypatch.setenv("TWIN_FRAMES_PER_WORKER", str(10 * OLD))
     levels = (0.5, 1.0, 1.5, 2.0, 2.5)
-    corpus = freeze_tiny(tmp_path, OLD // len(levels), levels)
+    emulator = make_up_emulator(tmp_path / "made-up.npz")
+    corpus = freeze_tiny(tmp_path / "c", OLD // len(levels), levels, emulator=emulator)
     made: list[Made] = []
     kept = run._outcome
 
