@@ -70,6 +70,11 @@ def test_a_failure_that_cannot_be_read_is_one_all_the_same(corpus, text):
     assert reason.samples == [2] and "cannot be read" in reason.error
 
 
+def test_a_reason_cannot_steer_the_terminal(corpus):
+    fail(corpus, 2, json.dumps({"error": "a\x1b[2Jb\nc\u202e"}))
+    assert status(corpus).reasons[0].error == "a?[2Jb c?"
+
+
 def test_what_is_no_sample_of_the_plan_does_not_count(corpus):
     shutil.copytree(store.sample_folder(corpus, 1), corpus / "samples/000/000009")
     (corpus / "samples/000/0000x").mkdir()

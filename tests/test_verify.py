@@ -108,6 +108,10 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda c: shutil.copytree(c / SECOND, c / "samples/001/000002"),
         "samples/001/'000002': is no sample",
     ),
+    "strange folder": (
+        lambda c: (c / "samples/\x1b[2J").mkdir(),
+        r"samples/'\x1b[2J': is not a corpus's",
+    ),
     "temporary folder": (lambda c: (c / "samples/000/.000001.5.part").mkdir(), "000001.5.part: is temporary"),
     "flipped byte of a reference": (lambda c: flip(shared(c, ".exr")), ".exr: has changed"),
     "deleted reference": (lambda c: shared(c, ".png").unlink(), ".png: is missing"),

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 _TOLERATED = frozenset({PLAN, SAMPLES, EMULATOR, LOCK, index.FILE, "README.md"})
 _FOLDERS = frozenset({"samples", "references", "failed", "cache", "figures"})
 _LARGEST = 2**32  # bytes of a picture that is looked into
+_THOUSAND = re.compile(r"[0-9]{3,9}")
 _NUMBER = re.compile(r"[0-9]{6,12}")
 _SHARED = re.compile(r"references/([0-9a-f]{16})\.(exr|png)")
 
@@ -175,7 +176,7 @@ def check_places(folder: Path, plan: Plan) -> Iterator[Problem]:
         if (not known and not path.name.endswith(".part")) or path.is_symlink():
             yield Problem(shown(path.name), "is a link" if path.is_symlink() else "is not a corpus's")
     for thousand in sorted((folder / "samples").glob("*")):
-        if not thousand.is_dir() or thousand.is_symlink():
+        if not thousand.is_dir() or thousand.is_symlink() or not _THOUSAND.fullmatch(thousand.name):
             yield Problem(f"samples/{shown(thousand.name)}", "is not a corpus's")
             continue
         for path in sorted(thousand.iterdir()):

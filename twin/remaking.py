@@ -15,6 +15,7 @@ import numpy as np
 from scenes import exr
 from twin import store
 from twin.checking import Problem
+from twin.complaint import shown
 from twin.frame import versions
 from twin.planned import EMULATOR, IES, PLAN, SAMPLES
 
@@ -71,6 +72,8 @@ def _difference(old: Path, new: Path) -> str:
             text = f", by up to {np.abs(before - after).max()} counts"
     with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
         made = json.loads((old.parent / store.SAMPLE).read_text(encoding="utf-8"))["versions"]
-        others = [f"{name} {made.get(name)}" for name, here in versions().items() if made.get(name) != here]
+        others = [
+            f"{name} {shown(made.get(name))}" for name, here in versions().items() if made.get(name) != here
+        ]
         text += f" (made with {', '.join(others)[:200]})" if others else ""
     return text

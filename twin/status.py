@@ -94,7 +94,8 @@ def _failures(folder: Path) -> dict[int, str]:
             with open(place, "rb") as file:
                 said = json.loads(file.read(_MOST))
             if isinstance(said, dict) and isinstance(said.get("error"), str):
-                why = " ".join(said["error"].split())[:500] or why
+                told = " ".join(said["error"].split())[:500]
+                why = "".join(sign if sign.isprintable() else "?" for sign in told) or why
         except (OSError, ValueError, RecursionError):
             pass
         found[int(place.stem)] = why
