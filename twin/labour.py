@@ -38,6 +38,8 @@ QUIET = "DASK_LOGGING__DISTRIBUTED"
 FRAMES_PER_LIFE = 6000
 """Frames after which a worker is replaced, whatever it holds; TWIN_FRAMES_PER_WORKER in its environment is
 another number."""
+TRIM_FRAMES = 25
+"""Frames between two times that freed memory goes back to the system: it gets into ever smaller pieces."""
 YOUNG_FRAMES, MOST_GROWTH, SPARE_B = 50, 1.5, 256 * 2**20
 """A worker is replaced too when it holds so many times what it held after its first frames, and some."""
 
@@ -120,8 +122,7 @@ def _light(corpus: Corpus, number: int, found: Pressed) -> Made:
         if not _there(corpus, number):  # else a worker finished it, and was gone before it could say so
             contacts = found.contacts or sample.pressed(plan, number)
             sample.lit(plan, number, contacts, found.seconds, Path(corpus.folder))
-    held = memory_B()
-    _LIFE.lived(len(plan.indentation_mm), held)
+    held = _LIFE.lived(len(plan.indentation_mm))
     return Made(number, len(plan.indentation_mm), held, f"{socket.gethostname()}:{os.getpid()}")
 
 
@@ -200,8 +201,13 @@ class _Life:
     def __init__(self) -> None:
         self.frames, self.young_B, self.over = 0, 0, False
 
-    def lived(self, frames: int, held_B: int) -> None:
+    def lived(self, frames: int) -> int:
+        """Count some more frames, and return the memory that the process holds, bytes."""
+        if (self.frames + frames) // TRIM_FRAMES > self.frames // TRIM_FRAMES:
+            with suppress(OSError, AttributeError):
+                ctypes.CDLL(None).malloc_trim(0)
         self.frames += frames
+        held_B = memory_B()
         if self.frames <= YOUNG_FRAMES or not self.young_B:
             self.young_B = held_B
         grown = held_B > MOST_GROWTH * self.young_B + SPARE_B
@@ -209,6 +215,7 @@ class _Life:
             grown or self.frames >= int(os.environ.get("TWIN_FRAMES_PER_WORKER", FRAMES_PER_LIFE))
         ):
             self.over = _retire()
+        return held_B
 
 
 _LIFE = _Life()
