@@ -18,7 +18,7 @@ from pydantic_core import ErrorDetails
 
 Location = tuple[str | int, ...]
 
-_TAGS = frozenset({"number", "table"})  # pydantic's names for the kinds of a value that may be either
+_TAGS = frozenset({"number", "range", "table"})  # pydantic's names for the kinds of a value that may be either
 
 _NOTHING = object()
 _shorten = reprlib.Repr()
@@ -168,7 +168,8 @@ def _child(
     if isinstance(step, int):
         fixed = node.get("prefixItems", [])
         return fixed[step] if step < len(fixed) else node.get("items")
-    return node.get("properties", {}).get(step)
+    named = node.get("properties", {}).get(step)
+    return named if named is not None else node.get("additionalProperties") or None  # false where forbidden
 
 
 _BOUNDS = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}
