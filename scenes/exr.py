@@ -292,7 +292,9 @@ def _check_names(channels: bytes, path: StrPath, allowed: Collection[str]) -> No
         name, at = _text(channels, at)
         text = name.decode("utf-8", "replace")
         if text not in allowed or text in seen:
-            raise ImageError(f"{path}: channel: received {text[:60]!r}, allowed: each of {sorted(allowed)} once")
+            raise ImageError(
+                f"{path}: channel: received {text[:60]!r}, allowed: each of {sorted(allowed)} once"
+            )
         seen.add(text)
         at += 16
 

@@ -18,7 +18,9 @@ from pydantic_core import ErrorDetails
 
 Location = tuple[str | int, ...]
 
-_TAGS = frozenset({"number", "range", "table"})  # pydantic's names for the kinds of a value that may be either
+_TAGS = frozenset(
+    {"number", "range", "table"}
+)  # pydantic's names for the kinds of a value that may be either
 
 _NOTHING = object()
 _shorten = reprlib.Repr()

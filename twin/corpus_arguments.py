@@ -62,7 +62,11 @@ def _add_plan(actions: Any) -> None:
     plan.add_argument("--count", type=whole, metavar="N", help="only the first N samples of every group")
     plan.add_argument("--no-probe", action="store_true", help="simulate nothing, estimate nothing")
     plan.add_argument(
-        "--workers", type=number(above=0.0), default=2.0, metavar="N", help="cores to estimate for (default 2)"
+        "--workers",
+        type=number(above=0.0),
+        default=2.0,
+        metavar="N",
+        help="cores to estimate for (default 2)",
     )
     plan.add_argument(
         "--frames", type=whole, metavar="N", help="also say what a corpus of N frames of this kind would take"
