@@ -4,8 +4,8 @@ DIR/cache/KEY/ holds, of all frames in the order of the index,
 
     picture.npy             (frames, rows, columns[, 3]) uint16, counts times ``steps``
     reference.npy           (references, rows, columns[, 3]) uint16, the same
-    charge.npy, reference_charge.npy   with ``layers``: (.., n_led, rows, columns[, 3]) float16, mean charge of
-                            each block's pixels from each LED, as a share of the camera's full well
+    charge.npy, reference_charge.npy   with ``layers``: (.., n_led, rows, columns[, 3]) float16, mean charge
+                            of each block's pixels from each LED, as a share of the camera's full well
     cache.json              what it is, and the largest error that rounding to steps made
 
 KEY is a hash of shape, design and the SHA-256 of all files, so a cache of other frames is never taken for
@@ -104,8 +104,10 @@ class Cache:
         return self._maps["reference.npy"][self._code[row]] * np.float32(1.0 / self._steps[1])
 
     def charge(self, row: int, weights: NDArray[np.float64] | None, reference: bool) -> Float:
-        """Return the LEDs' charge, each times its weight, (rows, columns[, 3]) electrons; of the picture or of
-        its reference."""
+        """Return the LEDs' charge, each times its weight, (rows, columns[, 3]) electrons.
+
+        That of the picture, or of its reference.
+        """
         import torch
 
         name, place = ("reference_charge.npy", self._code[row]) if reference else ("charge.npy", row)

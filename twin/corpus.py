@@ -74,7 +74,7 @@ class Corpus:
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave what can be read again: a worker process needs none of it."""
-        left = {"table": None, "_kept": OrderedDict(), "_designs": OrderedDict()}
+        left: dict[str, Any] = {"_kept": OrderedDict(), "_designs": OrderedDict()}
         return {key: left.get(key, value) for key, value in self.__dict__.items() if key != "table"}
 
     def __len__(self) -> int:
@@ -148,7 +148,7 @@ class Corpus:
         return tuple(name for name in self.randomised if not name.startswith("press.indentation_mm"))
 
     def image(self, sample: int, level: int) -> NDArray[Any]:
-        """Return the picture, counts: uint8 or uint16; float32, the mean, where the camera averages frames."""
+        """Return the picture, counts: uint8, uint16, or float32 where the camera averages frames."""
         row = self.row(sample, level)
         if self.design_of(sample).camera.frames > 1:
             return self._counts(self._exr(row, "exr"), row)
@@ -215,7 +215,7 @@ class Corpus:
         return footprint(self.design_of(sample).sensor(), size, (x or 0.0, y or 0.0))
 
     def dataset(self, **options: Any) -> Frames:
-        """Return a map-style `torch.utils.data.Dataset` of the samples; options as of `twin.dataset.Frames`."""
+        """Return a map-style torch dataset of the samples; options as of `twin.dataset.Frames`."""
         from twin.dataset import Frames
 
         return Frames(self, **options)
@@ -239,7 +239,7 @@ class Corpus:
         layers: bool = False,
         progress: Callable[[int, int], None] | None = None,
     ) -> Cache:
-        """Return the cache of pictures of this size, built in DIR/cache if it is not there; see `twin.cache`."""
+        """Return the cache of pictures of this size, built if it is not there; see `twin.cache`."""
         from twin.cache import cached
 
         return cached(self, shape, layers=layers, progress=progress)

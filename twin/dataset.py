@@ -56,7 +56,8 @@ class Frames(Dataset[dict[str, Any]]):
         LEDs change.
     frames : how many exposures each picture is the mean of, with ``noise``; none for the camera's own.
     led_weights : (n_led,) factors, ("uniform", low, high) or ("lognormal", sd)
-        Factors of the LEDs' power, for picture and reference alike: given, or drawn for each sample and epoch.
+        Factors of the LEDs' power, for picture and reference alike: given, or drawn for each sample and
+        epoch.
         Without ``noise`` such pictures are what noisy ones tend to. Exact references cost 16 exposures each.
     cached : read from the cache (`twin.cache`), built if it is not there.
     mask : whether items hold a mask.
@@ -86,7 +87,7 @@ class Frames(Dataset[dict[str, Any]]):
         seed: int = 0,
     ) -> None:
         self.corpus, self.raw, self.per_led, self.mask, self.seed = corpus, raw, per_led, mask, seed
-        self.shape = corpus.shape if shape is None else tuple(shape)
+        self.shape = corpus.shape if shape is None else (shape[0], shape[1])
         self.block = blocks(corpus.shape, self.shape)
         self.levels = tuple(range(corpus.levels)) if levels is None else tuple(levels)
         if not self.levels or any(level not in range(corpus.levels) for level in self.levels):
@@ -247,7 +248,8 @@ def _checked(weights: Weights | None, leds: int) -> Any:
     if weights is None:
         return None
     allowed = f'{leds} numbers >= 0, ("uniform", low, high) or ("lognormal", sd)'
-    match tuple(weights):
+    given: tuple[Any, ...] = tuple(weights)
+    match given:
         case ("uniform", low, high) if _real(low) and _real(high) and 0 <= low <= high:
             return ("uniform", float(low), float(high))
         case ("lognormal", sd) if _real(sd) and 0 <= sd <= 10:
@@ -257,9 +259,9 @@ def _checked(weights: Weights | None, leds: int) -> Any:
     raise DesignError("led_weights", shown(weights), allowed)
 
 
-def _real(value: object) -> bool:
+def _real(value: Any) -> bool:
     number = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
-    return number and bool(np.isfinite(value))  # type: ignore[call-overload]
+    return number and bool(np.isfinite(value))
 
 
 def loader(

@@ -31,7 +31,7 @@ _KEPT: dict[Any, tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
 
 
 def sight(sensor: Sensor) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return x and y, mm, at which each pixel's line of sight meets the undeformed surface, (rows, columns)."""
+    """Return x and y, mm, where each pixel's line of sight meets the undeformed surface, (rows, columns)."""
     camera, guide, glass = sensor.camera, sensor.guide, sensor.glass
     lens = (camera.shape, camera.pitch_mm, camera.field_of_view_mm, camera.distance_mm, camera.distortion)
     key = (lens, guide.thickness_mm, guide.refractive_index, glass.thickness_mm, glass.refractive_index)

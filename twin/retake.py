@@ -50,7 +50,7 @@ def average(picture: NDArray[Any], block: tuple[int, int]) -> Float:
 def taken(
     design: Design, layers: NDArray[Any], weights: NDArray[np.float64] | None, seed: int, level_mm: float
 ) -> NDArray[Any]:
-    """Return a new noisy picture of layers (n_led, rows, columns[, 3]), counts, exactly as the camera takes it.
+    """Return a new noisy picture of layers (n_led, rows, columns[, 3]), counts, as the camera takes it.
 
     ``weights`` (n_led,) multiply the LEDs' power. The same seed and level give the same picture.
     """
