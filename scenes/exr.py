@@ -150,6 +150,51 @@ def decode_exr_header(data: bytes, path: StrPath) -> dict[str, str]:
     return {key: value for key, value in sorted(found.items()) if key not in _OWN and isinstance(value, str)}
 
 
+def read_exr_text(path: StrPath, most: int = 2**20) -> dict[str, str]:
+    """The text that `write_exr` kept, read from the file's first bytes only: fast, and blind to the pixels.
+
+    Raises ImageError, in one line, for a file that is missing, not EXR, or with a head of more than `most` bytes.
+    """
+    try:
+        with open(path, "rb") as file:
+            data = file.read(2**14)
+            while True:
+                try:
+                    return _head_text(data)
+                except (IndexError, struct.error) as error:
+                    more = file.read(len(data)) if len(data) < most else b""
+                    if not more:
+                        raise ImageError(f"{path}: EXR file is cut short or damaged in its head") from error
+                    data += more
+    except OSError as error:
+        raise ImageError(f"{path}: cannot be read ({error.strerror})") from error
+    except ValueError as error:
+        raise error if isinstance(error, ImageError) else ImageError(f"{path}: {error}") from error
+
+
+def _head_text(data: bytes) -> dict[str, str]:
+    """Text attributes of an EXR head; IndexError or struct.error where the bytes end before it does.
+
+    Layout: OpenEXR file layout, "header".
+    """
+    if not data.startswith(b"\x76\x2f\x31\x01"):
+        raise ValueError("not an EXR file")
+    found, at = {}, 8
+    while data[at] != 0:
+        name, at = _text(data, at)
+        kind, at = _text(data, at)
+        (size,) = struct.unpack_from("<i", data, at)
+        at += 4
+        if size < 0:
+            raise ValueError("damaged EXR file (attribute of negative size)")
+        if at + size >= len(data):
+            raise IndexError(at)
+        if kind == b"string" and name.decode("utf-8", "replace") not in _OWN:
+            found[name.decode()] = data[at : at + size].decode()
+        at += size
+    return found
+
+
 def write_png(path: StrPath, image: NDArray[Any]) -> None:
     """Write counts, (rows, columns) or (rows, columns, 3), uint8 or uint16, as a PNG, grey or RGB."""
     array = np.asarray(image)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 
+from twin import interrupt
 from twin.complaint import DesignError
 
 
@@ -16,6 +17,37 @@ def run(arguments: argparse.Namespace) -> int:
 def _plan(arguments: argparse.Namespace) -> int:
     if arguments.out is None:
         raise DesignError("--out", "nothing", "the folder to make for the corpus")
+    if arguments.no_probe and arguments.frames is not None:
+        raise DesignError("--frames", "it with --no-probe", "one of them")
+    from twin.plan import freeze
+    from twin.probe import described, measure, projected
+    from twin.reporting import Reporter
+
+    with Reporter() as report:
+
+        def tell(stage: str, done: float) -> None:
+            interrupt.stop_if_asked()
+            report(stage, done)
+
+        plan = freeze(
+            arguments.study,
+            arguments.out,
+            seed=arguments.seed,
+            mechanics=arguments.mechanics,
+            emulator=arguments.emulator,
+            quality=arguments.quality,
+            light=arguments.light,
+            count=arguments.count,
+            progress=tell,
+        )
+    print(described(plan), flush=True)
+    if arguments.no_probe:
+        return 0
+    with Reporter() as report:
+        cost = measure(plan, tell)
+    print(projected(plan, cost, len(plan) * len(plan.indentation_mm), arguments.workers))
+    if arguments.frames is not None:
+        print(projected(plan, cost, arguments.frames, arguments.workers))
     return 0
 
 

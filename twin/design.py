@@ -11,6 +11,7 @@ import json
 import tomllib
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import lru_cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -317,6 +318,9 @@ def design_schema() -> dict[str, Any]:
     }
 
 
+_schema = lru_cache(maxsize=1)(design_schema)
+
+
 def shipped_designs() -> list[str]:
     """Return the names of the designs that come with the package."""
     names = (entry.name for entry in files("assets").joinpath("designs").iterdir())
@@ -354,7 +358,7 @@ def load_design(name_or_path: str | Path) -> Design:
 
 def parse_design(data: dict[str, Any], source: str = "") -> Design:
     """Return the design that nested tables describe; ``source`` names them in the error."""
-    schema = design_schema()
+    schema = _schema()
     found = list(not_finite(data, schema))
     if found:
         first = found[0]
