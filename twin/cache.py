@@ -154,15 +154,17 @@ def cached(
 
     wanted = corpus.shape if shape is None else (int(shape[0]), int(shape[1]))
     block = blocks(corpus.shape, wanted)
-    folder = folder_of(corpus, wanted, layers)
-    if not (folder / _NOTE).is_file():
+    layers = layers or (folder_of(corpus, wanted, True) / _NOTE).is_file()  # which holds the pictures too
+    if not (folder_of(corpus, wanted, layers) / _NOTE).is_file():
         _build(corpus, wanted, block, layers, workers, progress)
     return Cache(corpus, wanted, layers)
 
 
 def folder_of(corpus: Corpus, shape: tuple[int, int], layers: bool) -> Path:
     """Return where the cache lies of these frames, of this shape."""
-    told = hashlib.sha256(json.dumps([FORMAT, shape, layers, corpus.plan["design"]], sort_keys=True).encode())
+    told = hashlib.sha256(
+        json.dumps([FORMAT, shape, layers, corpus.plan.head.design_sha256], sort_keys=True).encode()
+    )
     for name in ("sample", "reference", "sha256_exr", "sha256_png", "sha256_reference", *corpus.randomised):
         for chunk in corpus.arrow[name].chunks:
             array = chunk.to_numpy(zero_copy_only=False)

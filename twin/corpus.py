@@ -10,7 +10,6 @@ Everything that is read is checked first (`twin.corpus_files`): a corpus may com
 
 from __future__ import annotations
 
-import copy
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from functools import cached_property
@@ -24,9 +23,10 @@ from scenes import exr
 from scenes.camera import count_dtype
 from twin import store
 from twin.complaint import DesignError, shown
-from twin.corpus_files import INCLUSION, inside, read_checked, read_facts, read_index
-from twin.design import Design, parse_design
+from twin.corpus_files import INCLUSION, inside, read_checked, read_index
+from twin.design import Design
 from twin.footprint import footprint
+from twin.planned import load_plan
 
 if TYPE_CHECKING:
     import pandas
@@ -52,7 +52,7 @@ class Corpus:
     name, description : of the study.
     design : `twin.Design` that randomised values are put into; `design_of` has those of a sample.
     indentation_mm : nominal press levels.
-    planned : how many samples there are to be.
+    plan : `twin.plan.Plan`; ``len(plan)`` samples are to be made.
     arrow : index, `pyarrow.Table` of one row per frame, sorted by sample and level.
     samples : (n,) int64, numbers of the samples that are there.
     """
@@ -62,12 +62,10 @@ class Corpus:
         self.path = Path(path)
         if not self.path.is_dir():
             raise DesignError("corpus", shown(str(path)), "the folder of a corpus")
-        facts = read_facts(self.path)
-        self._tables = facts.tables
-        self.plan: dict[str, Any] = facts.told
-        self.name, self.description, self.design = facts.name, facts.description, facts.design
-        self.indentation_mm, self.planned = facts.indentation_mm, facts.count
-        self.arrow: pyarrow.Table = read_index(self.path, facts)
+        self.plan = plan = load_plan(self.path)
+        self.name, self.description, self.design = plan.name, plan.description, plan.base
+        self.indentation_mm = plan.indentation_mm
+        self.arrow: pyarrow.Table = read_index(self.path, plan)
         self.samples: NDArray[np.int64] = self.arrow["sample"].to_numpy()[:: self.levels]
         self._kept: OrderedDict[tuple[str, str], NDArray[Any]] = OrderedDict()
         self._designs: OrderedDict[int, Design] = OrderedDict()
@@ -81,7 +79,7 @@ class Corpus:
         return len(self.samples)
 
     def __repr__(self) -> str:
-        there = f"{len(self)} of {self.planned} samples"
+        there = f"{len(self)} of {len(self.plan)} samples"
         return f"Corpus({self.name!r}, {there}, {self.levels} levels, {self.shape[1]} x {self.shape[0]})"
 
     @property
@@ -125,27 +123,14 @@ class Corpus:
 
     def design_of(self, sample: int) -> Design:
         """Return the design of a sample, with its own randomised values. Raises `DesignError`."""
-        row = self.row(sample)
-        if not self._fields:
+        self.row(sample)
+        if not self.randomised:
             return self.design
         if sample not in self._designs:
-            tables = copy.deepcopy(self._tables)
-            for name in self._fields:
-                _put(tables, name, self.cell(name, row))
-            design = parse_design(tables, f"{self.path}: sample {sample}")
-            mine, all_ = design.camera, self.design.camera
-            if (mine.shape, mine.colour, mine.bits) != (all_.shape, all_.colour, all_.bits):
-                allowed = "one size, colour and number of bits for all"
-                raise DesignError("camera", f"another in sample {sample}", allowed)
             if len(self._designs) >= 1000:
                 self._designs.popitem(last=False)
-            self._designs[sample] = design
+            self._designs[sample] = self.plan.design(sample)
         return self._designs[sample]
-
-    @cached_property
-    def _fields(self) -> tuple[str, ...]:
-        # How deep was really pressed is no field of the design: the index has it as indentation_mm.
-        return tuple(name for name in self.randomised if not name.startswith("press.indentation_mm"))
 
     def image(self, sample: int, level: int) -> NDArray[Any]:
         """Return the picture, counts: uint8, uint16, or float32 where the camera averages frames."""
@@ -315,17 +300,3 @@ def _fits(plane: NDArray[Any], highest: float) -> bool:
         return True
     lowest, most = plane.min(), plane.max()  # NaN passes through both
     return bool(lowest >= 0 and most <= highest and np.isfinite(most))
-
-
-def _put(tables: dict[str, Any], name: str, value: float) -> None:
-    """Set a dotted field of nested tables, where there is one."""
-    place: Any = tables
-    *way, last = name.split(".")
-    try:
-        for step in way:
-            place = place[int(step)] if isinstance(place, list) else place[step]
-        key: Any = int(last) if isinstance(place, list) else last
-        whole = isinstance(place[key], int) and not isinstance(place[key], bool)
-        place[key] = int(value) if whole and float(value).is_integer() else value
-    except (KeyError, IndexError, TypeError, ValueError):
-        raise DesignError(f"column {name}", "it", "a field that the plan's design has") from None
