@@ -10,6 +10,7 @@ from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
 from twin.complaint import DesignError, shown
+from twin.labour import QUIET
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -40,13 +41,14 @@ def crew(workers: int | None, scheduler: str | None) -> Iterator[Client]:
         If no scheduler answers under the address.
     """
     # Before Dask is imported, here and in its workers: it tells a terminal a lot that is no news to a user.
-    os.environ["DASK_LOGGING__DISTRIBUTED"] = "CRITICAL"
+    os.environ[QUIET] = "CRITICAL"
     import dask
 
     with dask.config.set(_QUIET):
         from distributed import Client
 
-        logging.getLogger("distributed").setLevel(logging.CRITICAL)
+        for name in ("distributed", "tornado.application", "asyncio"):
+            logging.getLogger(name).setLevel(logging.CRITICAL + 1)
         if scheduler is not None:
             with _elsewhere(Client, scheduler) as client:
                 yield client

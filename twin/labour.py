@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ctypes
 import errno
+import logging
 import os
 import socket
 import threading
@@ -32,6 +33,8 @@ FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 """Errors of a disk with no room left."""
 _UNWRITABLE = FULL | {errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.ESTALE, errno.ENOTCONN}
 
+QUIET = "DASK_LOGGING__DISTRIBUTED"
+"""Environment variable: the level from which Dask logs, when set before Dask is imported."""
 FRAMES_PER_LIFE = 6000
 """Frames after which a worker is replaced, whatever it holds."""
 YOUNG_FRAMES, MOST_GROWTH, SPARE_B = 50, 1.5, 256 * 2**20
@@ -142,6 +145,8 @@ def _ready(corpus: Corpus) -> Plan:
 @cache
 def prepare() -> None:
     """Make this process fit to work: one thread, Mitsuba on the CPU. Once per process, whoever started it."""
+    if os.environ.get(QUIET) == "CRITICAL":  # a run's own worker, which shares its terminal
+        logging.disable(logging.CRITICAL)
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[name] = "1"
     from threadpoolctl import threadpool_limits

@@ -55,6 +55,8 @@ class Progress:
     """Of `done`, how many by this run."""
     workers: int = 0
     started: float = field(default_factory=time.monotonic)
+    notes: list[str] = field(default_factory=list)
+    """What a user should know at the end, a line each."""
     recent: deque[float] = field(default_factory=lambda: deque(maxlen=_RATE_OVER))
 
     def count(self) -> None:
@@ -125,6 +127,9 @@ def run(
                 if scheduler is None or state.done + state.failed >= state.planned:
                     sweep(folder)  # what workers left that were killed
                 table.write()
+                state.notes += [f"cannot be read: {line}" for line in list(table.bad.values())[:10]]
+                if table.bad:
+                    state.notes.append(f"{len(table.bad)} samples cannot be read: twin corpus verify DIR --repair")
     except OSError as error:
         raise Stopped(labour.trouble(error).error) from error
     return state
