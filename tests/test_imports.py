@@ -21,7 +21,7 @@ ALLOWED = {
     "twin": {"assets", "estimation", "fem", "scenes"}
     | {"dask", "distributed", "drjit", "matplotlib", "mitsuba", "mpl_toolkits", "numpy", "OpenEXR"}
     | {"pandas", "PIL", "psutil", "pyarrow", "pydantic", "pydantic_core", "pyvista", "rich", "scipy"}
-    | {"skfem", "torch", "trimesh"},
+    | {"skfem", "threadpoolctl", "torch", "trimesh"},
 }
 MAX_LINES = 400
 

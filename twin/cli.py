@@ -54,6 +54,7 @@ _FLAGS = {
     "ply": "--ply",
     "out": "--out",
     "device": "--device",
+    "count": "--count",
 }
 
 

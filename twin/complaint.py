@@ -171,9 +171,17 @@ def _child(
         fixed = node.get("prefixItems", [])
         return fixed[step] if step < len(fixed) else node.get("items")
     named = node.get("properties", {}).get(step)
-    return named if named is not None else node.get("additionalProperties") or None  # false where forbidden
+    if named is not None:
+        return named
+    # keys that are names of the user's own; true or false where any or none may stand
+    own = next(iter(node.get("patternProperties", {}).values()), node.get("additionalProperties"))
+    return own if isinstance(own, Mapping) else None
 
 
+_PATTERNS = {
+    r"^[A-Za-z0-9][A-Za-z0-9_.-]*$": "a name of letters, digits, _ . and -, 100 characters at most",
+    r"^[0-9a-f]{64}$": "64 hexadecimal digits in quotes",
+}
 _BOUNDS = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}
 
 
@@ -183,12 +191,16 @@ def _in_words(schema: Mapping[str, Any], node: Mapping[str, Any] | None) -> str:
         return " or ".join(_in_words(schema, kind) for kind in node["oneOf"])
     if "enum" in node:
         return "one of " + ", ".join(repr(choice) for choice in node["enum"])
+    if "const" in node:
+        return repr(node["const"])
     match node.get("type"):
         case "boolean":
             return "true or false"
         case "number" | "integer" as kind:
             bounds = [f"{sign} {node[key]:g}" for key, sign in _BOUNDS.items() if key in node]
             return " ".join(["a number" if kind == "number" else "an integer", " and ".join(bounds)]).strip()
+        case "string" if node.get("pattern") in _PATTERNS:
+            return _PATTERNS[node["pattern"]]
         case "string":
             most = f" of 1 to {node['maxLength']} characters" if node.get("minLength") else ""
             return (

@@ -59,14 +59,35 @@ examples:
 """
 
 
+_EXPORT = """\
+Write what is finished in the format of other people's training code, into a new folder, all or nothing:
+webdataset (tar shards, one entry per sample), hf (Parquet shards with pictures inside, for
+datasets.load_dataset) or png (folders of pictures, metadata.csv and metadata.jsonl).
+
+examples:
+  twin corpus export corpora/paper --format webdataset --out exports/paper --shape 246 384
+  twin corpus export corpora/paper --format hf --out exports/paper-hf --shards 8
+"""
+
+_CARD = """\
+Write the corpus's card: README.md and figures (pictures, histograms, correlation of surface and picture,
+noise and error) of what is finished.
+
+examples:
+  twin corpus card corpora/paper
+"""
+
+
 def add(verbs: Any) -> None:
     """Add the verb and its actions to the parser of `twin.arguments`."""
-    corpus = _parser(verbs, "corpus", "training corpora: plan, run, status, verify", _CORPUS)
+    corpus = _parser(verbs, "corpus", "training corpora: plan, run, status, verify, export, card", _CORPUS)
     actions = corpus.add_subparsers(dest="action", metavar="ACTION", title="actions", required=True)
     _add_plan(actions)
     _add_run(actions)
     _add_status(actions)
     _add_verify(actions)
+    _add_export(actions)
+    _add_card(actions)
 
 
 def _parser(place: Any, name: str, summary: str, text: str) -> Parser:
@@ -112,9 +133,15 @@ def _add_plan(actions: Any) -> None:
 def _add_run(actions: Any) -> None:
     run = _parser(actions, "run", "make what is missing", _RUN)
     run.add_argument("directory", metavar="DIR", help="folder of the corpus")
-    run.add_argument("--workers", type=whole, metavar="N", help="processes on this machine (default: one per core)")
-    run.add_argument("--scheduler", metavar="ADDRESS", help="a Dask scheduler, as tcp://127.0.0.1:8786, instead")
-    run.add_argument("--retries", type=whole, default=1, metavar="N", help="for a sample that fails (default 1)")
+    run.add_argument(
+        "--workers", type=whole, metavar="N", help="processes on this machine (default: one per core)"
+    )
+    run.add_argument(
+        "--scheduler", metavar="ADDRESS", help="a Dask scheduler, as tcp://127.0.0.1:8786, instead"
+    )
+    run.add_argument(
+        "--retries", type=whole, default=1, metavar="N", help="for a sample that fails (default 1)"
+    )
 
 
 def _add_status(actions: Any) -> None:
@@ -130,5 +157,32 @@ def _add_verify(actions: Any) -> None:
         "--resimulate", type=whole, default=2, metavar="N", help="random samples to make again (default 2)"
     )
     verify.add_argument("--seed", type=whole, default=0, metavar="N", help="which ones (default 0)")
-    verify.add_argument("--workers", type=whole, metavar="N", help="processes to make them (default: one per core)")
-    verify.add_argument("--repair", action="store_true", help="remove what is damaged, so that run makes it again")
+    verify.add_argument(
+        "--workers", type=whole, metavar="N", help="processes to make them (default: one per core)"
+    )
+    verify.add_argument(
+        "--repair", action="store_true", help="remove what is damaged, so that run makes it again"
+    )
+
+
+def _add_export(actions: Any) -> None:
+    export = _parser(actions, "export", "WebDataset, Hugging Face or PNG", _EXPORT)
+    export.add_argument("directory", metavar="DIR", help="folder of the corpus")
+    formats = ("webdataset", "hf", "png")
+    export.add_argument("--format", type=choice(*formats), metavar="F", help=", ".join(formats))
+    export.add_argument("--out", metavar="OUT", help="new folder for the export")
+    export.add_argument(
+        "--shape",
+        type=whole,
+        nargs=2,
+        metavar=("ROWS", "COLUMNS"),
+        help="smaller pictures, means of whole pixels",
+    )
+    export.add_argument(
+        "--shards", type=whole, metavar="N", help="files of webdataset and hf (default: by size)"
+    )
+
+
+def _add_card(actions: Any) -> None:
+    card = _parser(actions, "card", "README.md and figures of what is there", _CARD)
+    card.add_argument("directory", metavar="DIR", help="folder of the corpus")

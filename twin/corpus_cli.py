@@ -44,8 +44,12 @@ def _plan(arguments: argparse.Namespace) -> int:
     print(described(plan), flush=True)
     if arguments.no_probe:
         return 0
-    with Reporter() as report:
-        cost = measure(plan, tell)
+    try:
+        with Reporter() as report:
+            cost = measure(plan, tell)
+    except KeyboardInterrupt:
+        print("twin corpus plan: interrupted in the probe; the plan is written", file=sys.stderr)
+        return 130
     print(projected(plan, cost, len(plan) * len(plan.indentation_mm), arguments.workers))
     if arguments.frames is not None:
         print(projected(plan, cost, arguments.frames, arguments.workers))
@@ -74,13 +78,19 @@ def _run(arguments: argparse.Namespace) -> int:
             return _failed("run", str(error))
         except KeyboardInterrupt:
             tell.close()
-            print("twin corpus run: interrupted; what is finished stays, run again continues", file=sys.stderr)
+            print(
+                "twin corpus run: interrupted; what is finished stays, run again continues", file=sys.stderr
+            )
             return 130
-    print(f"{state.done} of {state.planned} samples are there, {state.made} of them new: {arguments.directory}")
+    print(
+        f"{state.done} of {state.planned} samples are there, {state.made} of them new: {arguments.directory}"
+    )
     for line in state.notes:
         print(line)
     if state.failed:
-        return _failed("run", f"{state.failed} samples failed; twin corpus status {arguments.directory} says why")
+        return _failed(
+            "run", f"{state.failed} samples failed; twin corpus status {arguments.directory} says why"
+        )
     return 0
 
 
@@ -122,6 +132,48 @@ def _verify(arguments: argparse.Namespace) -> int:
     return 0 if found.good else 1
 
 
+def _export(arguments: argparse.Namespace) -> int:
+    for name, what in (("format", "webdataset, hf or png"), ("out", "the folder to make for the export")):
+        if getattr(arguments, name) is None:
+            raise DesignError(f"--{name}", "nothing", what)
+    from twin.corpus import Corpus
+    from twin.exporting import export
+    from twin.reporting import Reporter
+
+    corpus = Corpus(arguments.directory)
+    with Reporter() as report:
+        written = export(
+            corpus,
+            arguments.out,
+            arguments.format,
+            shape=None if arguments.shape is None else tuple(arguments.shape),
+            shards=arguments.shards,
+            progress=_told(report, "samples"),
+        )
+    size = sum(path.stat().st_size for path in written)
+    print(f"{len(corpus)} samples in {len(written)} files, {size / 1e6:.3g} MB: {arguments.out}")
+    return 0
+
+
+def _card(arguments: argparse.Namespace) -> int:
+    from twin.card import write_card
+    from twin.corpus import Corpus
+    from twin.reporting import Reporter
+
+    with Reporter() as report:
+        written = write_card(Corpus(arguments.directory), _told(report, "figures"))
+    print(f"card: {written[0]}")
+    return 0
+
+
+def _told(report: Callable[[str, float], None], stage: str) -> Callable[[int, int], None]:
+    def tell(done: int, total: int) -> None:
+        interrupt.stop_if_asked()
+        report(stage, done / total)
+
+    return tell
+
+
 def _failed(action: str, line: str) -> int:
     print(f"twin corpus {action}: {' '.join(line.split())}", file=sys.stderr)
     return 1
@@ -132,4 +184,6 @@ _ACTIONS: dict[str, Callable[[argparse.Namespace], int]] = {
     "run": _run,
     "status": _status,
     "verify": _verify,
+    "export": _export,
+    "card": _card,
 }

@@ -120,6 +120,7 @@ def _paths(node: Any, so_far: Path, steps: list[str], where: str, key: str) -> l
     raise DesignError(where, shown(key), f"a field that the design has; nothing lies below{place[3:]}")
 
 
+@lru_cache(maxsize=MOST)
 def limits(path: Path) -> Mapping[str, Any]:
     """Return the JSON schema's words on a field of a design."""
     schema = _schema()
@@ -134,6 +135,7 @@ def limits(path: Path) -> Mapping[str, Any]:
 _schema = lru_cache(maxsize=1)(design_schema)
 
 
+@lru_cache(maxsize=MOST)
 def path_of(field: str) -> Path:
     """Return ``leds.0.z_mm`` as ``("leds", 0, "z_mm")``."""
     return tuple(int(step) if step.isdigit() else step for step in field.split("."))

@@ -26,7 +26,19 @@ from twin.draws import Stream
 from twin.fields import MOST, expand, number_at, path_of, put, tables_of
 from twin.presses import Quality
 from twin.sample_table import read_samples
-from twin.study import CONFIG, MAX_COUNT, MAX_TEXT, CorpusMechanics, LightSeed, Name, Randomise, Sampler, Seed
+from twin.study import (
+    CONFIG,
+    MAX_COUNT,
+    MAX_TEXT,
+    CorpusMechanics,
+    GroupName,
+    LightSeed,
+    Name,
+    Randomise,
+    Sampler,
+    Seed,
+    check_distribution,
+)
 
 PLAN = "plan.json"
 SAMPLES = "samples.parquet"
@@ -56,7 +68,7 @@ class SamplesFile:
 class PlannedGroup:
     """Samples that were drawn alike, and how often a draw was refused."""
 
-    name: Name
+    name: GroupName
     sampler: Sampler
     count: Annotated[int, Field(ge=1, le=MAX_COUNT)]
     redrawn: Annotated[int, Field(ge=0, lt=2**53)] = 0
@@ -154,10 +166,13 @@ class Plan:
 
     @property
     def shares_references(self) -> bool:
-        """Whether the pictures without inclusion are the same for all samples: an emulator's press of one
-        design, in the same light."""
-        varies = any("." in name for name in self.columns)
-        return self.mechanics == "emulator" and self.light_seed == "shared" and not varies
+        """Whether pictures without inclusion are the same for all samples.
+
+        Where anything of the design varies they are not, nor where finite elements press: each inclusion
+        has a mesh of its own.
+        """
+        fields = any("." in name for name in self.columns)
+        return self.light_seed == "shared" and self.mechanics == "emulator" and not fields
 
     @property
     def groups(self) -> tuple[PlannedGroup, ...]:
@@ -265,9 +280,13 @@ def load_plan(folder: str | Path) -> Plan:
         if total != head.samples.count or len({group.name for group in head.groups}) < len(head.groups):
             allowed = f"groups with a name for each, and samples.count = {head.samples.count} together"
             raise DesignError("groups", f"{total} samples", allowed)
+        for key, distribution in head.randomise.items():
+            check_distribution(f"randomise.{key}", distribution)
         fields = list(columns_of(tables, head))
     except DesignError as error:
         raise error.renamed(source=source) from None
+    except RecursionError:
+        raise DesignError("design", "tables nested too deep", "a few levels", source=source) from None
     columns = read_samples(place / SAMPLES, fields, head.groups)
     return Plan(place, head, columns)
 
@@ -311,14 +330,19 @@ def _head(place: Path, source: str) -> Head:
     except (ValueError, RecursionError):
         raise DesignError("the file", "text that is not JSON", allowed, source=source) from None
     schema = _HEAD.json_schema()
-    for complaint in not_finite(data, schema):
-        raise complaint.renamed(source=source)
+    try:
+        for complaint in not_finite(data, schema):
+            raise complaint.renamed(source=source)
+    except RecursionError:
+        raise DesignError("the file", "tables nested too deep", allowed, source=source) from None
     if isinstance(data, dict) and data.get("format") != FORMAT:
         known = f"{FORMAT}, which this version reads"
         raise DesignError("format", shown(data.get("format")), known, source=source)
     try:
         return _HEAD.validate_json(text, strict=True)
     except ValidationError as error:
+        if error.errors()[0]["type"] == "json_invalid":  # though Python's own reader took it
+            raise DesignError("the file", "tables nested too deep", allowed, source=source) from None
         raise from_validation(error, data, schema).renamed(source=source) from None
 
 

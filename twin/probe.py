@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+
+import numpy as np
 
 from twin.planned import Plan
 
@@ -40,7 +43,7 @@ class Cost:
 
 
 def measure(plan: Plan, progress: Callable[[str, float], None] | None = None) -> Cost:
-    """Simulate two samples of a plan, one after the other, into a folder that is thrown away.
+    """Simulate two samples of a plan on one core, one after the other, into a folder that is thrown away.
 
     The first one compiles and sets up; the second one is what the others will cost. They come from the middle
     of the plan, so that neither is an extreme of a grid, and have inclusions where any has.
@@ -48,24 +51,46 @@ def measure(plan: Plan, progress: Callable[[str, float], None] | None = None) ->
     from twin import sample
 
     tell = progress or (lambda stage, done: None)
-    numbers = [n for n in range(len(plan)) if not plan.columns["blank"][n]] or list(range(len(plan)))
+    numbers = np.flatnonzero(~plan.columns["blank"])
+    numbers = numbers if len(numbers) else np.arange(len(plan))
     middle = len(numbers) // 2
-    first, second = numbers[middle], numbers[min(middle + 1, len(numbers) - 1)]
-    with tempfile.TemporaryDirectory(prefix="twin-probe-") as folder:
-        tell("probe", 0.0)
-        begun = time.perf_counter()
-        sample.make(plan, first, Path(folder))
-        once = time.perf_counter() - begun
-        tell("probe", 0.5)
-        begun = time.perf_counter()
-        found = sample.make(plan, second, Path(folder) if second != first else Path(folder) / "again")
-        again = time.perf_counter() - begun
+    took, found = [], {}
+    with tempfile.TemporaryDirectory(prefix="twin-probe-") as folder, _one_thread():
+        for place, number in enumerate((numbers[middle], numbers[min(middle + 1, len(numbers) - 1)])):
+            tell("probe", place / 2)
+            corpus = Path(folder)
+            if place and len(numbers) == 1:  # the same one again: elsewhere
+                corpus = corpus / "again"
+                corpus.mkdir()
+            begun = time.perf_counter()
+            found = sample.make(plan, int(number), corpus)
+            took.append(time.perf_counter() - begun)
         tell("probe", 1.0)
+    once, again = took
     seconds: Mapping[str, float] = found["seconds"]
     parts = {part: float(seconds[part]) for part in ("mechanics", "light", "write")}
     rest = max(again - sum(parts.values()), 0.0)  # what none of the parts counted
     parts["write"] += rest
     return Cost(**parts, bytes=float(found["bytes"]), start=max(once - again, 0.0))
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Work as one of several workers does: on one thread."""
+    from threadpoolctl import threadpool_limits
+
+    from scenes import backend
+
+    backend.use("cpu")
+    import drjit  # only now: see scenes.backend
+
+    before = drjit.thread_count()
+    try:
+        backend.threads(1)
+        with threadpool_limits(1):
+            yield
+    finally:
+        backend.threads(max(before, 1))
 
 
 def described(plan: Plan) -> str:
@@ -100,7 +125,10 @@ def projected(plan: Plan, cost: Cost, frames: int, workers: float) -> str:
             f"files {cost.write:.2f}), {cost.bytes / 1e6:.2f} MB; {cost.start:.0f} s once per worker",
         ),
         ("core hours", f"{core_seconds / 3600:.3g}"),
-        (f"{workers:g} workers", f"{_span(core_seconds / workers + cost.start)}, {60 * rate:.1f} samples a minute"),
+        (
+            f"{workers:g} workers",
+            f"{_span(core_seconds / workers + cost.start)}, {60 * rate:.1f} samples a minute",
+        ),
         ("storage", _size(size)),
         ("bandwidth", f"{_size(rate * cost.bytes)}/s written by {workers:g} workers"),
         (

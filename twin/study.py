@@ -34,6 +34,8 @@ Sampler = Literal["uniform", "latin", "sobol", "grid", "table"]
 CorpusMechanics = Literal["finite", "linear", "emulator"]
 LightSeed = Literal["shared", "own"]
 Name = Annotated[str, Field(min_length=1, max_length=100, pattern=r"^[^\x00-\x1f\x7f-\x9f]*$")]
+GroupName = Annotated[str, Field(min_length=1, max_length=100, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
+"""Fit to be a file's name, which readers and exporters may make of it."""
 FileName = Annotated[str, Field(min_length=1, max_length=4000)]
 Number = Annotated[float, Field(ge=-1e9, le=1e9)]
 Count = Annotated[int, Field(ge=1, le=MAX_COUNT)]
@@ -71,7 +73,7 @@ class Ranges:
 class Group:
     """Samples that are drawn alike."""
 
-    name: Name
+    name: GroupName
     sampler: Sampler
     count: Count | None = None
     blanks: Annotated[Share, Field(description="share without inclusion")] = 0.0

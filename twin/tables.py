@@ -49,7 +49,7 @@ def read_table(place: Path, tables: Mapping[str, Any]) -> dict[str, NDArray[Any]
         defaults = _defaults(header, tables)
         columns: dict[str, list[float]] = {name: [] for name in (*PARAMETERS, *defaults)}
         for row in rows:
-            if any(cell.strip() for cell in row) or (row and len(header) == 1):
+            if row:
                 where = f"line {rows.line_num}"
                 if len(row) != len(header):
                     raise DesignError(where, f"{len(row)} values", f"{len(header)}, as the header has")
