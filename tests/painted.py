@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 
 from scenes import exr
@@ -109,7 +110,8 @@ def edit_index(corpus: Path, **columns: Any) -> None:
     for name, change in columns.items():
         place = table.schema.get_field_index(name)
         field = table.schema.field(place)
-        table = table.set_column(place, field, [change(table[name].to_pylist())])
+        values = pa.array(change(table[name].to_pylist()), field.type)
+        table = table.set_column(place, field, values)
     pq.write_table(table, corpus / index.FILE)
 
 
@@ -185,7 +187,12 @@ def _record(plan: Plan, number: int, level: int, depth: float, tsis: dict[str, A
         "blank": inclusion is None,
         "parameters": plan.parameters(number),
         "press": {"indentation_mm": depth, "force_N": 0.3 * depth, "nominal_mm": plan.indentation_mm[level]},
-        "fem": {"raw": scalars, "tared": scalars, "min_pressure_kPa": 0.5, "error_percent": None},
-        "tsis": {**tsis, "noise_percent": 0.5},
+        "fem": {
+            "raw": scalars,
+            "tared": scalars,
+            "min_pressure_kPa": 0.5,
+            "error_percent": 1.0 + 0.1 * number,
+        },
+        "tsis": {**tsis, "noise_percent": 0.4 + 0.02 * number + 0.05 * level},
         "seed": {"light": 0, "camera": 0},
     }

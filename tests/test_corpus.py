@@ -70,7 +70,10 @@ def test_what_was_written_comes_back(corpus):
         (lambda c: c.image(0, 2), "level: received 2; allowed 0 to 1"),
         (lambda c: c.image(True, 0), "sample: received True"),
         (lambda c: c.field(0, 0, "x"), "field: received 'x'"),
-        (lambda c: c.dataset(shape=(10, 64)), r"shape: received \(10, 64\); allowed \(rows, columns\) that divide"),
+        (
+            lambda c: c.dataset(shape=(10, 64)),
+            r"shape: received \(10, 64\); allowed \(rows, columns\) that divide",
+        ),
         (lambda c: c.dataset(noise="x"), "noise: received 'x'"),
         (lambda c: c.dataset(frames=4), "frames: received 4 with noise = False"),
         (lambda c: c.dataset(led_weights=[1.0]), r"led_weights: received \[1.0\]; allowed 4 numbers"),
@@ -154,13 +157,14 @@ def test_a_new_exposure_with_the_old_seed_is_the_old_picture(shared):
 
 
 def test_fast_noise_has_the_cameras_mean_and_variance(corpus):
-    """Blocks of 2 x 2 pixels, 150 exposures each: means within 5 standard errors, spread within 1 %."""
+    """Blocks of 2 x 2 pixels, 150 exposures: means within 5 standard errors, spread within 1 %."""
     layers, design, block, count = corpus.layers(0, 1), corpus.design, (2, 2), 150
     rng = np.random.default_rng(3)
     charge = retake.charge(design, layers, None, block)
     fast = np.array([retake.counts(design, charge, block, 1, rng) for _ in range(count)], np.float64)
     exact = np.array(
-        [retake.average(retake.taken(design, layers, None, seed, 2.0), block) for seed in range(count)], np.float64
+        [retake.average(retake.taken(design, layers, None, seed, 2.0), block) for seed in range(count)],
+        np.float64,
     )
     spread = exact.std(axis=0, ddof=1)
     error = spread.mean() * np.sqrt(2 / count)
@@ -183,7 +187,8 @@ def test_light_is_linear_in_the_leds(varied):
     design, layers = varied.design_of(0), varied.layers(0, 1)
     assert design.camera.gain_e_per_dn != varied.design.camera.gain_e_per_dn
     each = [
-        varied.dataset(led_weights=np.eye(4)[led].tolist(), raw=True)[0]["image"][1].numpy() for led in range(4)
+        varied.dataset(led_weights=np.eye(4)[led].tolist(), raw=True)[0]["image"][1].numpy()
+        for led in range(4)
     ]
     none = varied.dataset(led_weights=[0.0] * 4, raw=True)[0]["image"][1].numpy()
     weights = [0.5, 1.0, 1.5, 0.0]
@@ -216,7 +221,9 @@ def test_drawn_weights_are_the_same_for_picture_and_reference(corpus):
     assert np.std(drawn) == pytest.approx(0.2, rel=0.1) and abs(np.mean(drawn)) < 0.03
 
 
-@pytest.mark.parametrize("options", [{}, {"noise": "exact"}, {"noise": "fast", "led_weights": ("lognormal", 0.1)}])
+@pytest.mark.parametrize(
+    "options", [{}, {"noise": "exact"}, {"noise": "fast", "led_weights": ("lognormal", 0.1)}]
+)
 def test_workers_and_order_change_nothing(shared, options):
     def epochs(workers, shuffle):
         batches = shared.loader(2, workers, shuffle=shuffle, seed=11, shape=(24, 32), **options)
@@ -239,7 +246,9 @@ def test_workers_and_order_change_nothing(shared, options):
 
 def test_shuffling_is_by_seed(shared):
     def order(seed, workers):
-        return [n for batch in shared.loader(1, workers, seed=seed, mask=False) for n in batch["sample"].tolist()]
+        return [
+            n for batch in shared.loader(1, workers, seed=seed, mask=False) for n in batch["sample"].tolist()
+        ]
 
     assert order(1, 0) == order(1, 2) and sorted(order(1, 0)) == list(range(5))
     assert len({tuple(order(seed, 0)) for seed in range(6)}) > 1

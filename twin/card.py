@@ -224,4 +224,5 @@ def _human(size: float) -> str:
 def _plain(value: Any) -> str:
     """Return text of a stranger's as one line that Markdown takes for words."""
     line = " ".join(str(value).split())
-    return "".join(f"\\{sign}" if sign in "\\`*_[]<>|#!" else sign for sign in line)
+    line = line.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+    return "".join(f"\\{sign}" if sign in "\\`*_[]|#!" else sign for sign in line)
