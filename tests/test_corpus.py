@@ -122,7 +122,7 @@ def test_smaller_pictures_are_exact_means(corpus, block):
 
 
 def test_mask_is_the_disc_under_the_inclusion(corpus):
-    """Area of a disc, and its middle, in closed form; pixels are 0.39 mm, so the border is worth a per cent."""
+    """Area of a disc and its middle, in closed form, within what the pixels at its border are worth."""
     design = twin.load_design("tsis")
     sensor, camera = design.sensor(), design.camera
     pixel = camera.field_of_view_mm * camera.field_height_mm / np.prod(camera.shape)

@@ -1,4 +1,4 @@
-"""A corpus from a stranger: what does not fit is refused in one line before it is unpacked, and runs nothing."""
+"""A corpus from a stranger: what does not fit is refused in one line, unread, and runs nothing."""
 
 import io
 import os

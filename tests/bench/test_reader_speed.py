@@ -15,11 +15,11 @@ import numpy as np
 import OpenEXR
 import pytest
 import torch
+from painted import paint
 from torch.utils.data import DataLoader, Dataset
 
 import twin
 from scenes import exr
-from painted import paint
 
 WORKERS, BATCH, SECONDS = 2, 8, 4.0
 SHAPE = (246, 384)
