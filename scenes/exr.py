@@ -153,7 +153,8 @@ def decode_exr_header(data: bytes, path: StrPath) -> dict[str, str]:
 def read_exr_text(path: StrPath, most: int = 2**20) -> dict[str, str]:
     """The text that `write_exr` kept, read from the file's first bytes only: fast, and blind to the pixels.
 
-    Raises ImageError, in one line, for a file that is missing, not EXR, or with a head of more than `most` bytes.
+    Raises ImageError, in one line, for a file that is missing, not EXR, or whose head has more than `most`
+    bytes.
     """
     try:
         with open(path, "rb") as file:

@@ -49,13 +49,14 @@ examples:
 """
 
 _VERIFY = """\
-Read every file of a corpus and compare it with its SHA-256, the frames with the plan, the index with the frames;
-then simulate a few random samples again and compare the bytes. Names whatever is wrong, a line each, and exits 1.
+Read every file of a corpus and compare it with its SHA-256, the frames with the plan, the index with the
+frames; then simulate a few random samples again and compare the bytes. Names whatever is wrong, a line each,
+and exits 1.
 
 examples:
   twin corpus verify corpora/paper
   twin corpus verify corpora/paper --resimulate 10 --workers 2
-  twin corpus verify corpora/paper --resimulate 0 --repair && twin corpus run corpora/paper
+  twin corpus verify corpora/paper --repair; twin corpus run corpora/paper
 """
 
 

@@ -1,4 +1,4 @@
-"""Who does the work of a corpus: worker processes of Dask on this machine, or those of a scheduler elsewhere."""
+"""Who does the work of a corpus: Dask's workers on this machine, or those of a scheduler elsewhere."""
 
 from __future__ import annotations
 
@@ -18,13 +18,12 @@ if TYPE_CHECKING:
 ANSWER_S = 10.0
 """Longest wait for a scheduler that was given by its address."""
 
-_QUIET = {
+_QUIET: dict[str, Any] = {
     "distributed.worker.profile.enabled": False,  # costs time and memory, and nobody looks at it
     "distributed.scheduler.allowed-failures": 3,  # workers that a task may take with it
     "distributed.scheduler.worker-ttl": None,  # a solve may hold Python for minutes
     "distributed.comm.retry.count": 3,
     "distributed.admin.low-level-log-length": 1000,
-    "distributed.nanny.environ": {},
 }
 
 
@@ -32,8 +31,8 @@ _QUIET = {
 def crew(workers: int | None, scheduler: str | None) -> Iterator[Client]:
     """Yield a client of so many one-thread processes (default: one per core), or of the scheduler's workers.
 
-    Local ones are reachable from this machine only, ignore Ctrl-C (who asked for them ends them), and end with
-    this process, however it ends.
+    Local ones are reachable from this machine only, do not hear Ctrl-C (who asked for them ends them), and
+    end with this process, however it ends.
 
     Raises
     ------
@@ -43,10 +42,9 @@ def crew(workers: int | None, scheduler: str | None) -> Iterator[Client]:
     # Before Dask is imported, here and in its workers: it tells a terminal a lot that is no news to a user.
     os.environ[QUIET] = "CRITICAL"
     import dask
+    from distributed import Client
 
     with dask.config.set(_QUIET):
-        from distributed import Client
-
         for name in ("distributed", "tornado.application", "asyncio"):
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)
         if scheduler is not None:

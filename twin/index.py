@@ -90,7 +90,9 @@ def _typed(row: Mapping[str, Any], plan: Plan) -> dict[str, Any]:
     return found
 
 
-def table_of(corpus: Path, plan: Plan, numbers: Iterable[int], sha256: str) -> tuple[pa.Table, dict[int, str]]:
+def table_of(
+    corpus: Path, plan: Plan, numbers: Iterable[int], sha256: str
+) -> tuple[pa.Table, dict[int, str]]:
     """Return the rows of these samples, in this order, and for those that cannot be read, why (one line)."""
     rows: list[dict[str, Any]] = []
     bad: dict[int, str] = {}
@@ -172,5 +174,7 @@ def read(corpus: Path, plan: Plan, sha256: str) -> pa.Table:
                 raise ValueError("more rows than frames")
             return file.read()
     except (OSError, ValueError, TypeError, MemoryError, OverflowError, pa.ArrowException) as error:
-        what = error.strerror if isinstance(error, OSError) and error.strerror else " ".join(str(error).split())
+        what = (
+            error.strerror if isinstance(error, OSError) and error.strerror else " ".join(str(error).split())
+        )
         raise ValueError(f"{FILE}: cannot be read ({str(what)[:120]})") from None

@@ -1,8 +1,8 @@
 """What a worker of a corpus does: one function each for mechanics, light and a shared reference.
 
 They are the tasks that Dask runs, named by corpus, plan and sample, so nothing large is sent to a worker, and
-one that joins late needs no preparation. They raise nothing: what goes wrong is their answer (`Trouble`), since
-who counts, retries and records it is the run, not Dask.
+one that joins late needs no preparation. They raise nothing: what goes wrong is their answer (`Trouble`),
+since it is the run that counts, retries and records it, not Dask.
 """
 
 from __future__ import annotations
@@ -181,7 +181,9 @@ def _plan(corpus: Corpus) -> Plan:
     try:
         found = store.sha256(folder / PLAN)
     except OSError as error:
-        raise WrongCorpus(f"{socket.gethostname()}: {folder / PLAN}: cannot be read ({error.strerror})") from None
+        raise WrongCorpus(
+            f"{socket.gethostname()}: {folder / PLAN}: cannot be read ({error.strerror})"
+        ) from None
     if found != corpus.plan:
         raise WrongCorpus(f"{socket.gethostname()}: {folder / PLAN}: is not the plan that is being run")
     return load_plan(folder)
@@ -202,7 +204,9 @@ class _Life:
         if self.frames <= YOUNG_FRAMES or not self.young_B:
             self.young_B = held_B
         grown = held_B > MOST_GROWTH * self.young_B + SPARE_B
-        if not self.over and (grown or self.frames >= int(os.environ.get("TWIN_FRAMES_PER_WORKER", FRAMES_PER_LIFE))):
+        if not self.over and (
+            grown or self.frames >= int(os.environ.get("TWIN_FRAMES_PER_WORKER", FRAMES_PER_LIFE))
+        ):
             self.over = _retire()
 
 

@@ -50,12 +50,12 @@ def _open(place: Path) -> int:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             with suppress(FileNotFoundError):
-                if os.path.sameopenfile(handle, handle) and os.stat(place).st_ino == os.fstat(handle).st_ino:
+                if os.stat(place).st_ino == os.fstat(handle).st_ino:
                     return handle
         except BlockingIOError:
             os.close(handle)
-            allowed = "one run at a time: wait for it, or stop it"
-            raise DesignError("DIR", f"{shown(str(place.parent))}, which {holder(place.parent)} is running", allowed) from None
+            received = f"{shown(str(place.parent))}, which {holder(place.parent) or 'another'} is running"
+            raise DesignError("DIR", received, "one run at a time: wait for it, or stop it") from None
         except BaseException:
             os.close(handle)
             raise

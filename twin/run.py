@@ -1,8 +1,8 @@
 """Run a corpus: make every sample of its plan that is not there yet, on as many processes as there are.
 
-A sample's mechanics and its light are two tasks, and only a few samples per worker are on their way at a time,
-so that a million of them do not weigh on the scheduler. What a sample is depends on plan and number alone:
-neither workers nor order nor an interruption show in it.
+A sample's mechanics and its light are two tasks, and only a few samples per worker are on their way at a
+time, so that a million of them do not weigh on the scheduler. What a sample is depends on plan and number
+alone: neither workers nor order nor an interruption show in it.
 """
 
 from __future__ import annotations
@@ -13,11 +13,13 @@ import queue
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from scenes import exr
 from twin import index, interrupt, labour, store
 from twin.complaint import DesignError, shown
 from twin.crew import crew
@@ -33,7 +35,7 @@ if TYPE_CHECKING:
 
 WINDOW = 4
 """Samples on their way for each worker."""
-_TICK_S = 0.5
+_TICK_S, _LOOK_EVERY_S = 0.5, 2.0
 _INDEX_EVERY_S = 300.0
 _LOST_S = 60.0
 _RATE_OVER = 200
@@ -115,24 +117,39 @@ def run(
         with locked(folder):
             sweep(folder)
             there = store.finished(folder)
-            wanted = range(len(plan)) if numbers is None else [plan._checked(number) for number in numbers]
+            wanted = _checked(plan, numbers)
             state = Progress(len(plan), len(there & set(wanted)) if numbers is None else len(there))
             table = index.Table(folder, plan, corpus.plan)
+
+            def close() -> None:
+                if scheduler is None or state.done + state.failed >= state.planned:
+                    sweep(folder)  # what workers left that were killed
+                table.write()
+
             try:
                 if any(number not in there for number in wanted):
                     with crew(workers, scheduler) as client:
                         todo = (number for number in wanted if number not in there)
                         _Run(client, plan, corpus, state, retries, tell, table).make(todo)
-            finally:
-                if scheduler is None or state.done + state.failed >= state.planned:
-                    sweep(folder)  # what workers left that were killed
-                table.write()
-                state.notes += [f"cannot be read: {line}" for line in list(table.bad.values())[:10]]
-                if table.bad:
-                    state.notes.append(f"{len(table.bad)} samples cannot be read: twin corpus verify DIR --repair")
-    except OSError as error:
+            except BaseException:
+                with suppress(exr.ImageError, OSError):
+                    close()
+                raise
+            close()
+            if table.bad:
+                line = f"{len(table.bad)} samples cannot be read, see verify --repair"
+                state.notes.append(f"{line}: {next(iter(table.bad.values()))}")
+    except (OSError, exr.ImageError) as error:
         raise Stopped(labour.trouble(error).error) from error
     return state
+
+
+def _checked(plan: Plan, numbers: Iterable[int] | None) -> Sequence[int]:
+    wanted: Sequence[int] = range(len(plan)) if numbers is None else list(dict.fromkeys(numbers))
+    for number in wanted if numbers is not None else ():
+        if not 0 <= number < len(plan):
+            raise DesignError("numbers", shown(number), f"integers from 0 to {len(plan) - 1}")
+    return wanted
 
 
 class _Run:
@@ -155,6 +172,7 @@ class _Run:
         self.ready: queue.SimpleQueue[Future] = queue.SimpleQueue()
         self.running: dict[Future, tuple[int, int]] = {}
         self.beat = self.indexed = time.monotonic()
+        self.looked = -_LOOK_EVERY_S
 
     def make(self, todo: Iterator[int]) -> None:
         again: deque[tuple[int, int]] = deque()
@@ -233,22 +251,19 @@ class _Run:
             self.beat = now
         elif self.client.status == "closed" or now - self.beat > _LOST_S:
             raise Stopped("the scheduler is gone; what is finished stays, run again continues")
-        self.state.workers = sum(self.client.nthreads().values()) if self.client.status == "running" else 0
+        if now - self.looked >= _LOOK_EVERY_S:
+            self.looked, alive = now, self.client.status == "running"
+            self.state.workers = sum(self.client.nthreads().values()) if alive else 0
         if now - self.indexed > _INDEX_EVERY_S:
             self.table.write()
             self.indexed = time.monotonic()
         self.tell(self.state)
 
     def _record(self, number: int, attempts: int, why: Trouble) -> None:
-        from scenes import exr
-
         place = store.failure_file(self.folder, number)
         place.parent.mkdir(exist_ok=True)
         said = {"sample": number, "error": why.error, "attempts": attempts, "traceback": why.traceback}
-        try:
-            exr.write_bytes(place, (json.dumps(said, indent=1, sort_keys=True) + "\n").encode())
-        except exr.ImageError as error:
-            raise Stopped(labour.trouble(error).error) from error
+        exr.write_bytes(place, (json.dumps(said, indent=1, sort_keys=True) + "\n").encode())
         self.state.failed += 1
 
 

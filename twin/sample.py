@@ -117,7 +117,7 @@ def lit(plan: Plan, number: int, contacts: list[Contact], seconds: float, corpus
 
 
 def refer(plan: Plan, number: int, level: int, contact: Contact, corpus: Path) -> None:
-    """Make the reference that the sample shares with others, unless it is there; nothing where it shares none."""
+    """Make the reference that the sample shares with others, unless it is there or it shares none."""
     if plan.shares_references:
         _reference(plan, number, level, contact, corpus, corpus)
 

@@ -1,4 +1,4 @@
-"""What of a corpus is there: planned, done, missing, failed and why. Reads only, and needs no image library."""
+"""What of a corpus is there: planned, done, missing, failed and why. Reads only."""
 
 from __future__ import annotations
 
@@ -64,7 +64,9 @@ def status(directory: str | Path) -> Status:
     folder = Path(directory)
     plan = load_plan(folder)
     done = {number for number in store.finished(folder) if number < len(plan)}
-    failed = {number: why for number, why in _failures(folder).items() if number < len(plan) and number not in done}
+    failed = {
+        number: why for number, why in _failures(folder).items() if number < len(plan) and number not in done
+    }
     return Status(
         name=plan.name,
         folder=str(folder),
@@ -142,7 +144,8 @@ def as_json(found: Status) -> str:
 def in_words(found: Status) -> str:
     """Return the status as a few lines."""
     lines = [
-        f"{found.name}: {found.done} of {found.planned} samples done, {found.missing} missing, {found.failed} failed",
+        f"{found.name}: {found.done} of {found.planned} samples done, "
+        f"{found.missing} missing, {found.failed} failed",
         f"frames: {found.frames}, {_bytes(found.bytes)}" + ("" if found.indexed else ", no index yet"),
     ]
     if found.per_minute is not None:
@@ -153,7 +156,9 @@ def in_words(found: Status) -> str:
         which = ", ".join(map(str, reason.samples)) + (", ..." if reason.count > len(reason.samples) else "")
         lines.append(f"failed ({reason.count}; {which}): {reason.error}")
     if found.leftovers:
-        whose = "of the run that is going on" if found.running else "of a run that was killed; run removes them"
+        whose = (
+            "of the run that is going on" if found.running else "of a run that was killed; run removes them"
+        )
         lines.append(f"temporary: {len(found.leftovers)}, {whose}")
     if not found.running and found.done < found.planned:
         lines.append(f"next: twin corpus run {found.folder}")

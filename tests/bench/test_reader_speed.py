@@ -51,7 +51,7 @@ def corpus(tmp_path_factory: pytest.TempPathFactory) -> twin.Corpus:
 
 
 class Naive(Dataset[torch.Tensor]):
-    """What one writes without us: all of the frame as float32, sum of the LEDs less the reference's, resized."""
+    """What one writes without us: all of the frame as float32, the LEDs less the reference's, resized."""
 
     def __init__(self, corpus: twin.Corpus) -> None:
         rows = corpus.arrow.select(["exr", "reference"]).to_pylist()
