@@ -16,7 +16,7 @@ SHARE = 1 / 50
 
 @pytest.fixture(scope="module")
 def frames():
-    design = twin.load_design("tsis")
+    design = twin.load_design("tsis").pressed(mechanics="linear")
     return twin.simulate(design, twin.Inclusion(10.0, 5.0, 100.0), LEVELS, quality="preview", seed=1)
 
 

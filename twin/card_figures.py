@@ -146,9 +146,21 @@ def scalars(corpus: Corpus) -> Figure:
         for level, colour in enumerate(_colours(corpus.levels)):
             x = corpus.table[across].to_numpy()[level :: corpus.levels] * factor
             y = corpus.table[up].to_numpy()[level :: corpus.levels] / 10.0**power
-            told = f"{corpus.indentation_mm[level]:g} mm: r = {pearson(x, y):.3f}"
+            r = pearson(x, y)
+            told = f"{corpus.indentation_mm[level]:g} mm: " + (
+                "all alike" if math.isnan(r) else f"r = {r:.3f}"
+            )
             step = max(1, math.ceil(len(x) / _MOST_POINTS))
-            axis.plot(x[::step], y[::step], "o", ms=3.5, mew=0, alpha=0.7, color=colour, label=told)
+            axis.plot(
+                x[::step],
+                y[::step],
+                "o",
+                ms=3.5,
+                mew=0,
+                alpha=0.7,
+                color=colour,
+                label=told if level in _named(corpus, 5) else None,
+            )
         axis.set_title(title, fontsize=10, color=_INK, loc="left")
         axis.set_xlabel(f"surface: {words}", fontsize=9)
         axis.set_ylabel(f"picture: {unit.format(f'$10^{power}$ ' if power else '')}", fontsize=9)
@@ -198,11 +210,21 @@ def _by_level(corpus: Corpus, axis: Axes, name: str) -> None:
         axis.set_yticks([])
         return
     edges = np.linspace(values.min(), values.max(), 25)
-    for level, colour in enumerate(_colours(corpus.levels)):
-        part = corpus.table[name].to_numpy()[level :: corpus.levels]
-        told = f"{corpus.indentation_mm[level]:g} mm"
-        axis.hist(part[np.isfinite(part)], bins=edges, color=colour, alpha=0.75, label=told)
-    axis.legend(fontsize=8, frameon=False, handlelength=1, borderaxespad=0.2)
+    parts = [corpus.table[name].to_numpy()[level :: corpus.levels] for level in range(corpus.levels)]
+    parts = [part[np.isfinite(part)] for part in parts]
+    named = _named(corpus, 3)
+    told = [f"{depth:g} mm" if level in named else "_" for level, depth in enumerate(corpus.indentation_mm)]
+    axis.hist(parts, bins=edges, stacked=True, color=_colours(corpus.levels), label=told)
+    axis.set_ylim(0, 1.25 * axis.get_ylim()[1])  # room for the legend above the bars
+    axis.legend(
+        fontsize=8, frameon=False, ncol=len(named), handlelength=0.8, handletextpad=0.3, columnspacing=0.9,
+        loc="upper left", borderaxespad=0.1, borderpad=0.1,
+    )  # fmt: skip
+
+
+def _named(corpus: Corpus, most: int) -> set[int]:
+    """Return the press levels that a legend has room for, the first and the last among them."""
+    return set(np.linspace(0, corpus.levels - 1, min(corpus.levels, most)).round().astype(int).tolist())
 
 
 def _histogram(axis: Axes, values: NDArray[Any]) -> None:

@@ -222,12 +222,13 @@ class Corpus:
         shape: tuple[int, int] | None = None,
         *,
         layers: bool = False,
+        workers: int = 0,
         progress: Callable[[int, int], None] | None = None,
     ) -> Cache:
         """Return the cache of pictures of this size, built if it is not there; see `twin.cache`."""
         from twin.cache import cached
 
-        return cached(self, shape, layers=layers, progress=progress)
+        return cached(self, shape, layers=layers, workers=workers, progress=progress)
 
     def kept(self, name: str, what: str, read: Callable[[], NDArray[Any]]) -> NDArray[Any]:
         """Return an array of a file, from memory if it was read lately by this process;
