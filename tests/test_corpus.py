@@ -156,9 +156,11 @@ def test_a_new_exposure_with_the_old_seed_is_the_old_picture(shared):
         assert np.array_equal(image, shared.image(sample, 1))
 
 
-def test_fast_noise_has_the_cameras_mean_and_variance(corpus):
+@pytest.mark.parametrize("read_noise_e", [12.0, 200.0])
+def test_fast_noise_has_the_cameras_mean_and_variance(corpus, read_noise_e):
     """Blocks of 2 x 2 pixels, 150 exposures: means within 5 standard errors, spread within 1 %."""
-    layers, design, block, count = corpus.layers(0, 1), corpus.design, (2, 2), 150
+    layers, block, count = corpus.layers(0, 1), (2, 2), 150
+    design = replace(corpus.design, camera=replace(corpus.design.camera, read_noise_e=read_noise_e))
     rng = np.random.default_rng(3)
     charge = retake.charge(design, layers, None, block)
     fast = np.array([retake.counts(design, charge, block, 1, rng) for _ in range(count)], np.float64)
