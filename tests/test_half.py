@@ -56,7 +56,13 @@ def test_half_floats_are_far_below_the_noise(frames, tmp_path):
 
 
 def test_tared_scalars_do_not_move(frames, tmp_path):
-    """Against their own spread over new noise: a hundredth of it, without noise in between."""
+    """Against their own spread over new noise, without noise in between: a tenth of it.
+
+    The area counts pixels on one side of k, and each whose mean lies within d of k may change sides: with c
+    pixels per count there, the camera's noise s makes the area spread by sqrt(c s / sqrt(pi)), and rounding d
+    moves it by sqrt(c d sqrt(2 / pi)), so by sqrt(1.4 d / s) spreads (three of these here).
+    """
+    most = {"max_dn": 0.1, "total_dn": 0.1, "area_px": 3.0 * np.sqrt(1.4 * SHARE)}
     for frame, level in zip(frames, LEVELS, strict=True):
         design, k = frame.design, frame.design.signal.counts
         half, _ = stored(frame, tmp_path / "frame.exr")
@@ -79,7 +85,7 @@ def test_tared_scalars_do_not_move(frames, tmp_path):
             print(
                 f"{level:g} mm {name}: {found[0][name]:.6g}, moved {moved:.3g}, spread of noise {spread:.3g}"
             )
-            assert moved <= 0.1 * spread + 1e-9 * abs(found[0][name])
+            assert moved <= most[name] * spread
 
 
 def test_fields_are_kept_to_half_a_thousandth(frames, tmp_path):

@@ -213,8 +213,8 @@ def _by_level(corpus: Corpus, axis: Axes, name: str) -> None:
     parts = [corpus.table[name].to_numpy()[level :: corpus.levels] for level in range(corpus.levels)]
     parts = [part[np.isfinite(part)] for part in parts]
     named = _named(corpus, 3)
-    told = [f"{depth:g} mm" if level in named else "_" for level, depth in enumerate(corpus.indentation_mm)]
-    axis.hist(parts, bins=edges, stacked=True, color=_colours(corpus.levels), label=told)
+    names = [f"{depth:g} mm" if level in named else "_" for level, depth in enumerate(corpus.indentation_mm)]
+    axis.hist(parts, bins=edges, stacked=True, color=_colours(corpus.levels), label=names)
     axis.set_ylim(0, 1.25 * axis.get_ylim()[1])  # room for the legend above the bars
     axis.legend(
         fontsize=8, frameon=False, ncol=len(named), handlelength=0.8, handletextpad=0.3, columnspacing=0.9,
