@@ -77,7 +77,7 @@ def test_tared_scalars_do_not_move(frames, tmp_path):
         ]
         noisy = [
             scalars(exposure.take(design, frame.radiance, seed, level) - frame.reference, k)
-            for seed in range(8)
+            for seed in range(24)  # 8 gave a spread of 28, 24 one of 38, where theory has 48
         ]
         for name in ("max_dn", "total_dn", "area_px"):
             spread = np.std([one[name] for one in noisy], ddof=1)
