@@ -1,6 +1,7 @@
 """What all tests share."""
 
 import os
+from pathlib import Path
 
 import pytest
 
@@ -15,3 +16,11 @@ def variant() -> str:
     from scenes.backend import use
 
     return use("cpu")
+
+
+@pytest.fixture(scope="session")
+def finished_corpus(variant: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small corpus that is whole; tests that change something copy it."""
+    from corpora import finish_tiny
+
+    return finish_tiny(tmp_path_factory.mktemp("finished"))
