@@ -60,14 +60,35 @@ examples:
 """
 
 
+_EXPORT = """\
+Write what is finished in the format of other people's training code, into a new folder, all or nothing:
+webdataset (tar shards, one entry per sample), hf (Parquet shards with pictures inside, for
+datasets.load_dataset) or png (folders of pictures, metadata.csv and metadata.jsonl).
+
+examples:
+  twin corpus export corpora/paper --format webdataset --out exports/paper --shape 246 384
+  twin corpus export corpora/paper --format hf --out exports/paper-hf --shards 8
+"""
+
+_CARD = """\
+Write the corpus's card: README.md and figures (pictures, histograms, correlation of surface and picture,
+noise and error) of what is finished.
+
+examples:
+  twin corpus card corpora/paper
+"""
+
+
 def add(verbs: Any) -> None:
     """Add the verb and its actions to the parser of `twin.arguments`."""
-    corpus = _parser(verbs, "corpus", "training corpora: plan, run, status, verify", _CORPUS)
+    corpus = _parser(verbs, "corpus", "training corpora: plan, run, status, verify, export, card", _CORPUS)
     actions = corpus.add_subparsers(dest="action", metavar="ACTION", title="actions", required=True)
     _add_plan(actions)
     _add_run(actions)
     _add_status(actions)
     _add_verify(actions)
+    _add_export(actions)
+    _add_card(actions)
 
 
 def _parser(place: Any, name: str, summary: str, text: str) -> Parser:
@@ -143,3 +164,26 @@ def _add_verify(actions: Any) -> None:
     verify.add_argument(
         "--repair", action="store_true", help="remove what is damaged, so that run makes it again"
     )
+
+
+def _add_export(actions: Any) -> None:
+    export = _parser(actions, "export", "WebDataset, Hugging Face or PNG", _EXPORT)
+    export.add_argument("directory", metavar="DIR", help="folder of the corpus")
+    formats = ("webdataset", "hf", "png")
+    export.add_argument("--format", type=choice(*formats), metavar="F", help=", ".join(formats))
+    export.add_argument("--out", metavar="OUT", help="new folder for the export")
+    export.add_argument(
+        "--shape",
+        type=whole,
+        nargs=2,
+        metavar=("ROWS", "COLUMNS"),
+        help="smaller pictures, means of whole pixels",
+    )
+    export.add_argument(
+        "--shards", type=whole, metavar="N", help="files of webdataset and hf (default: by size)"
+    )
+
+
+def _add_card(actions: Any) -> None:
+    card = _parser(actions, "card", "README.md and figures of what is there", _CARD)
+    card.add_argument("directory", metavar="DIR", help="folder of the corpus")

@@ -132,6 +132,48 @@ def _verify(arguments: argparse.Namespace) -> int:
     return 0 if found.good else 1
 
 
+def _export(arguments: argparse.Namespace) -> int:
+    for name, what in (("format", "webdataset, hf or png"), ("out", "the folder to make for the export")):
+        if getattr(arguments, name) is None:
+            raise DesignError(f"--{name}", "nothing", what)
+    from twin.corpus import Corpus
+    from twin.exporting import export
+    from twin.reporting import Reporter
+
+    corpus = Corpus(arguments.directory)
+    with Reporter() as report:
+        written = export(
+            corpus,
+            arguments.out,
+            arguments.format,
+            shape=None if arguments.shape is None else tuple(arguments.shape),
+            shards=arguments.shards,
+            progress=_told(report, "samples"),
+        )
+    size = sum(path.stat().st_size for path in written)
+    print(f"{len(corpus)} samples in {len(written)} files, {size / 1e6:.3g} MB: {arguments.out}")
+    return 0
+
+
+def _card(arguments: argparse.Namespace) -> int:
+    from twin.card import write_card
+    from twin.corpus import Corpus
+    from twin.reporting import Reporter
+
+    with Reporter() as report:
+        written = write_card(Corpus(arguments.directory), _told(report, "figures"))
+    print(f"card: {written[0]}")
+    return 0
+
+
+def _told(report: Callable[[str, float], None], stage: str) -> Callable[[int, int], None]:
+    def tell(done: int, total: int) -> None:
+        interrupt.stop_if_asked()
+        report(stage, done / total)
+
+    return tell
+
+
 def _failed(action: str, line: str) -> int:
     print(f"twin corpus {action}: {' '.join(line.split())}", file=sys.stderr)
     return 1
@@ -142,4 +184,6 @@ _ACTIONS: dict[str, Callable[[argparse.Namespace], int]] = {
     "run": _run,
     "status": _status,
     "verify": _verify,
+    "export": _export,
+    "card": _card,
 }
