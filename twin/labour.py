@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ctypes
 import errno
+import gc
 import logging
 import os
 import socket
@@ -204,6 +205,7 @@ class _Life:
     def lived(self, frames: int) -> int:
         """Count some more frames, and return the memory that the process holds, bytes."""
         if (self.frames + frames) // TRIM_FRAMES > self.frames // TRIM_FRAMES:
+            gc.collect()  # cycles of arrays, some tens of MiB between two collections of Python's own
             with suppress(OSError, AttributeError):
                 ctypes.CDLL(None).malloc_trim(0)
         self.frames += frames
