@@ -79,7 +79,8 @@ def main(argv: list[str] | None = None) -> int:
     except (DesignError, fem.NotModelled, fem.NotConverged, NotModelled, BackendError) as error:
         return _fail(name, _with_flags(str(error)), 2)
     except KeyboardInterrupt:
-        kept = "what was solved is kept" if arguments.verb == "emulate" else "nothing was written"
+        kept = {"emulate": "what was solved is kept", "corpus": "what is finished stays"}.get(arguments.verb)
+        kept = kept or "nothing was written"
         return _fail(name, f"interrupted; {kept}", 130)
     except BrokenPipeError:  # `twin schema | head`
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115 (Python flushes it on its way out)

@@ -87,6 +87,11 @@ def _run(arguments: argparse.Namespace) -> int:
     )
     for line in state.notes:
         print(line)
+    if state.made and state.done == state.planned:
+        try:
+            _write_card(arguments.directory)
+        except DesignError as error:  # somebody's own README.md
+            print(f"no card was written: {error}")
     if state.failed:
         return _failed(
             "run", f"{state.failed} samples failed; twin corpus status {arguments.directory} says why"
@@ -156,14 +161,18 @@ def _export(arguments: argparse.Namespace) -> int:
 
 
 def _card(arguments: argparse.Namespace) -> int:
+    _write_card(arguments.directory)
+    return 0
+
+
+def _write_card(directory: str) -> None:
     from twin.card import write_card
     from twin.corpus import Corpus
     from twin.reporting import Reporter
 
     with Reporter() as report:
-        written = write_card(Corpus(arguments.directory), _told(report, "figures"))
-    print(f"card: {written[0]}")
-    return 0
+        written = write_card(Corpus(directory), _told(report, "card"))
+    print(f"look at: {written[0]}")
 
 
 def _told(report: Callable[[str, float], None], stage: str) -> Callable[[int, int], None]:

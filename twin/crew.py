@@ -91,7 +91,7 @@ def _elsewhere(client_of: Any, address: str) -> Iterator[Client]:
 
 @contextmanager
 def _local(count: int) -> Iterator[Any]:
-    from distributed import LocalCluster
+    from distributed import LocalCluster, Security
 
     # Threads that start here never see Ctrl-C, nor do the processes that they start, also later.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
@@ -103,6 +103,8 @@ def _local(count: int) -> Iterator[Any]:
                 threads_per_worker=1,
                 processes=True,
                 host="127.0.0.1",
+                protocol="tls://",  # others on this machine may not speak to workers, which would obey them
+                security=Security.temporary(),
                 # No dashboard, but Dask serves pages in any case: to this machine only, on any free port.
                 dashboard_address="127.0.0.1:0",
                 worker_dashboard_address="127.0.0.1:0",

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import TypeAdapter
 
 from twin import presses, store
 from twin.design import Design
@@ -137,7 +136,7 @@ def _reference(
     """Return the reference of one level, of the sample's own or shared with all samples of equal light."""
     design, (light, camera) = plan.design(number), plan.seeds(number)
     if plan.shares_references:
-        key = _key(plan, design, contact, light)
+        key = _key(plan, contact, light)
         name, place, seed = f"references/{key}", corpus / "references" / key, light
         if shared := _shared(str(place), name):
             return shared
@@ -183,9 +182,11 @@ def _shared(place: str, name: str) -> _Reference | None:
     return _found(place, name, (stamp[0].st_mtime_ns, stamp[1].st_mtime_ns))
 
 
-def _key(plan: Plan, design: Design, contact: Contact, light: int) -> str:
+def _key(plan: Plan, contact: Contact, light: int) -> str:
     """Return a name for all that decides a reference: the same name, the same bytes."""
-    told = hashlib.sha256(TypeAdapter(Design).dump_json(design))
+    told = hashlib.sha256()
+    head = plan.head  # its design, not that of the sample, which knows where the corpus lies
+    told.update(repr((head.design_sha256, sorted(head.ies.items()))).encode())
     told.update(repr((plan.light, light, contact.level_mm)).encode())
     for array in (contact.surface.points, contact.surface["pressure_0"], contact.surface["displacement_0"]):
         told.update(np.ascontiguousarray(array, np.float64).tobytes())
