@@ -19,8 +19,9 @@ ALLOWED = {
     "scenes": {"drjit", "mitsuba", "numpy", "OpenEXR", "PIL", "pydantic"}
     | {"pyvista", "scipy", "threadpoolctl", "trimesh"},
     "twin": {"assets", "estimation", "fem", "scenes"}
-    | {"drjit", "matplotlib", "mitsuba", "mpl_toolkits", "numpy", "OpenEXR", "PIL", "pydantic"}
-    | {"pydantic_core", "pyvista", "rich", "scipy", "skfem", "torch", "trimesh"},
+    | {"dask", "distributed", "drjit", "matplotlib", "mitsuba", "mpl_toolkits", "numpy", "OpenEXR"}
+    | {"pandas", "PIL", "psutil", "pyarrow", "pydantic", "pydantic_core", "pyvista", "rich", "scipy"}
+    | {"skfem", "threadpoolctl", "torch", "trimesh"},
 }
 MAX_LINES = 400
 

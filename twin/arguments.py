@@ -98,6 +98,8 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
 
 
 def _parser() -> Parser:
+    from twin import corpus_arguments  # which takes its readers from here
+
     parser = Parser(
         prog="twin",
         description="Digital twin of the tactile sensation imaging system: from press to picture.",
@@ -167,6 +169,7 @@ def _parser() -> Parser:
     emulate.add_argument("--seed", type=whole, default=0, metavar="N", help="of the samples (default 0)")
     emulate.add_argument("--out", metavar="FILE.npz", help="the file to write")
 
+    corpus_arguments.add(verbs)
     _verb(verbs, "schema", "the JSON schema of a design file", _SCHEMA)
     return parser
 
@@ -305,6 +308,7 @@ _REWORDED = (
         r"argument (\S+): not allowed with argument (\S+)",
         r"\1: received together with \2; allowed one of them",
     ),
+    (r"the following arguments are required: (.*)", r"\1: received nothing; allowed what --help lists"),
     (r"unrecognized arguments: (.*)", r"received what it does not know: \1; allowed what --help lists"),
 )
 

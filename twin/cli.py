@@ -1,4 +1,4 @@
-"""The command line: ``twin demo``, ``simulate``, ``check``, ``export``, ``emulate``, ``schema``.
+"""The command line: ``twin demo``, ``simulate``, ``check``, ``export``, ``emulate``, ``corpus``, ``schema``.
 
 Exit status 0: done; 1: the machine failed (a full disk); 2: bad input, one line on stderr; 130: interrupted.
 Nothing slow is imported until the input has been checked.
@@ -54,6 +54,7 @@ _FLAGS = {
     "ply": "--ply",
     "out": "--out",
     "device": "--device",
+    "count": "--count",
 }
 
 
@@ -67,7 +68,7 @@ def main(argv: list[str] | None = None) -> int:
         arguments = parse(argv)
     except SystemExit as stop:  # argparse leaves this way, for --help too
         return int(stop.code or 0)
-    name = f"twin {arguments.verb}" if arguments.verb else "twin"
+    name = " ".join(["twin", *filter(None, (arguments.verb, getattr(arguments, "action", None)))])
     try:
         with interrupt.guarded():
             try:
@@ -117,6 +118,10 @@ def _run(arguments: argparse.Namespace) -> int:
         _export(arguments, _pressed(arguments), _inclusion(arguments))
     elif arguments.verb == "emulate":
         _emulate(arguments)
+    elif arguments.verb == "corpus":
+        from twin import corpus_cli
+
+        return corpus_cli.run(arguments)
     else:
         parse(["--help"])
     return 0

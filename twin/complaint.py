@@ -18,7 +18,9 @@ from pydantic_core import ErrorDetails
 
 Location = tuple[str | int, ...]
 
-_TAGS = frozenset({"number", "table"})  # pydantic's names for the kinds of a value that may be either
+_TAGS = frozenset(
+    {"number", "range", "table"}
+)  # pydantic's names for the kinds of a value that may be either
 
 _NOTHING = object()
 _shorten = reprlib.Repr()
@@ -168,9 +170,18 @@ def _child(
     if isinstance(step, int):
         fixed = node.get("prefixItems", [])
         return fixed[step] if step < len(fixed) else node.get("items")
-    return node.get("properties", {}).get(step)
+    named = node.get("properties", {}).get(step)
+    if named is not None:
+        return named
+    # keys that are names of the user's own; true or false where any or none may stand
+    own = next(iter(node.get("patternProperties", {}).values()), node.get("additionalProperties"))
+    return own if isinstance(own, Mapping) else None
 
 
+_PATTERNS = {
+    r"^[A-Za-z0-9][A-Za-z0-9_.-]*$": "a name of letters, digits, _ . and -, 100 characters at most",
+    r"^[0-9a-f]{64}$": "64 hexadecimal digits in quotes",
+}
 _BOUNDS = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}
 
 
@@ -180,12 +191,16 @@ def _in_words(schema: Mapping[str, Any], node: Mapping[str, Any] | None) -> str:
         return " or ".join(_in_words(schema, kind) for kind in node["oneOf"])
     if "enum" in node:
         return "one of " + ", ".join(repr(choice) for choice in node["enum"])
+    if "const" in node:
+        return repr(node["const"])
     match node.get("type"):
         case "boolean":
             return "true or false"
         case "number" | "integer" as kind:
             bounds = [f"{sign} {node[key]:g}" for key, sign in _BOUNDS.items() if key in node]
             return " ".join(["a number" if kind == "number" else "an integer", " and ".join(bounds)]).strip()
+        case "string" if node.get("pattern") in _PATTERNS:
+            return _PATTERNS[node["pattern"]]
         case "string":
             most = f" of 1 to {node['maxLength']} characters" if node.get("minLength") else ""
             return (

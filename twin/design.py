@@ -11,6 +11,7 @@ import json
 import tomllib
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import lru_cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -317,6 +318,9 @@ def design_schema() -> dict[str, Any]:
     }
 
 
+_schema = lru_cache(maxsize=1)(design_schema)
+
+
 def shipped_designs() -> list[str]:
     """Return the names of the designs that come with the package."""
     names = (entry.name for entry in files("assets").joinpath("designs").iterdir())
@@ -354,18 +358,19 @@ def load_design(name_or_path: str | Path) -> Design:
 
 def parse_design(data: dict[str, Any], source: str = "") -> Design:
     """Return the design that nested tables describe; ``source`` names them in the error."""
-    schema = design_schema()
-    found = list(not_finite(data, schema))
-    if found:
-        first = found[0]
-        raise DesignError(first.field, first.received, first.allowed, source=source, more=len(found) - 1)
     try:
         # As JSON, because only there does pydantic's strict mode take a table for a dataclass and a list for
         # a tuple while it still refuses "25" or true where a number belongs. JSON has no dates, and neither
         # has a design: true, which no field takes, is refused in their place.
-        return _ADAPTER.validate_json(json.dumps(data, default=lambda date: True), strict=True)
+        text = json.dumps(data, default=lambda date: True, allow_nan=False)
+    except ValueError:
+        first, *more = not_finite(data, _schema())
+        allowed = first.allowed
+        raise DesignError(first.field, first.received, allowed, source=source, more=len(more)) from None
+    try:
+        return _ADAPTER.validate_json(text, strict=True)
     except ValidationError as error:
-        raise from_validation(error, data, schema).renamed(source=source) from None
+        raise from_validation(error, data, _schema()).renamed(source=source) from None
 
 
 def _place(name_or_path: str | Path) -> Path:

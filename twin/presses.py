@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 import fem
+from fem import emulator_limits
 from fem.model import check as check_mechanics
 from twin.complaint import DesignError, shown
 from twin.design import Design
@@ -163,7 +165,7 @@ def emulated(
     fem.NotModelled
         For what it was not built for, and outside of its ranges, in one line.
     """
-    try:
+    with _in_designs_words():
         return [
             emulator(
                 design.probe(),
@@ -176,6 +178,32 @@ def emulated(
             )
             for level in levels
         ]
+
+
+def check_emulated(
+    design: Design, inclusion: fem.Inclusion | None, levels: Sequence[float], emulator: Emulator
+) -> None:
+    """Raise `fem.NotModelled` for what `emulated` would refuse of presses by depth, in microseconds."""
+    plan, pose = emulator.plan, design.press
+    with _in_designs_words():
+        emulator_limits.check(
+            plan,
+            design.probe(),
+            design.slab(),
+            inclusion,
+            plan.mechanics,
+            tilt=pose.tilt_deg,
+            position=pose.position_mm,
+        )
+        for level in levels:
+            emulator_limits.within("indentation", level, plan.ranges.indentation_mm, "mm")
+
+
+@contextmanager
+def _in_designs_words() -> Iterator[None]:
+    """Name what an emulator refuses as a design does."""
+    try:
+        yield
     except ValueError as error:
         field, colon, rest = str(error).partition(":")
         for start, name in _NAMES.items():
