@@ -51,6 +51,8 @@ class Rendering:
     sinks, trapped : (n_led, len(trace.SINKS)) and (n_led,), or None
         W that end in each sink, and W trapped at their first contact with the surface (see
         `transport.Light`); None for the reference quality.
+    traced : tuple of (n_led, layers, m, m), one for each band, or None
+        Light on the contact surface that was not gathered; `Renderer.render` takes it back.
     """
 
     radiance: NDArray[np.float32]
@@ -61,6 +63,7 @@ class Rendering:
     seconds: float
     sinks: Array | None = None
     trapped: Array | None = None
+    traced: tuple[Array, ...] | None = None
 
 
 class Renderer:
@@ -98,6 +101,7 @@ class Renderer:
         seed: int = 0,
         samples: int | None = None,
         noise: float | None = None,
+        traced: tuple[Array, ...] | None = None,
         progress: Callable[[float], None] | None = None,
     ) -> Rendering:
         """Return the radiance picture of a pressed contact surface.
@@ -117,6 +121,11 @@ class Renderer:
             Light paths per LED, instead of the quality's own number.
         noise
             Go on, pass by pass, until `noise_percent` is at most this.
+        traced
+            `Rendering.traced` of a press like this one, of the same sensor: nothing is traced then, only the
+            gathered light, the contact, the tissue and the camera's view are computed anew. No noise of its
+            own, so that differences of pictures are smooth, and up to 6 % off where LEDs shine in from air
+            (`tests/test_forward.py`), 10 % where they are embedded.
         progress
             Called with the finished share, 0 to 1.
         """
@@ -134,7 +143,10 @@ class Renderer:
         each = max(_PATHS_PER_PASS // len(self.sensor.leds), 1)
         passes = max(_LEAST_PASSES, -(-samples // each))
         lights: list[Light] = []
-        if quality == "reference":
+        if traced is not None:
+            self._check_leds(shape)
+            pictures, passes, noise = self._again(shape, sight, traced[0]), 1, None
+        elif quality == "reference":
             pictures = self._followed(sight, -(-samples // passes), seed)
         else:
             self._check_leds(shape)
@@ -151,6 +163,7 @@ class Renderer:
             time.perf_counter() - start,
             np.mean([light.sinks for light in lights], axis=0) if lights else None,
             np.mean([light.trapped for light in lights], axis=0) if lights else None,
+            (np.mean([light.traced for light in lights], axis=0),) if lights else traced,
         )
 
     def _check_leds(self, shape: surface.OpticalSurface) -> None:
@@ -178,6 +191,18 @@ class Renderer:
             lights.append(light)
             yield gather.picture(sight, light.upward)
 
+    def _again(
+        self, shape: surface.OpticalSurface, sight: Sight, traced: Array
+    ) -> Iterator[NDArray[np.floating]]:
+        """The one picture (n_led, rows, columns) with light that was traced before."""
+        from . import direct, gather, transport
+
+        straight = direct.direct(self.sensor, self.basis, shape)
+        ground = transport.survey(self.scene, self.sensor)
+        with threadpool_limits(1):
+            upward = transport.again(self.sensor, self.basis, self.behind, ground, straight, traced)
+        yield gather.picture(sight, upward)
+
     def _followed(self, sight: Sight, samples: int, seed: int) -> Iterator[NDArray[np.floating]]:
         """Pictures (n_led, rows, columns) of independent passes."""
         from . import exact, transport
@@ -200,6 +225,8 @@ def _averaged(
         layers = np.asarray(picture, dtype=np.float64)
         bright = layers.sum(axis=0)
         total, whole, squares = total + layers, whole + bright, squares + bright**2
+        if passes == 1:
+            return total, 0.0
         if number < min(passes, _LEAST_PASSES):
             continue
         variance = np.maximum(squares - whole**2 / number, 0.0) / max(number - 1, 1) / number

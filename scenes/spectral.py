@@ -70,6 +70,7 @@ class SpectralRenderer:
         quality: Quality = "standard",
         seed: int = 0,
         samples: int | None = None,
+        traced: tuple[NDArray[np.float64], ...] | None = None,
         progress: Callable[[float], None] | None = None,
         **options: Any,
     ) -> Rendering:
@@ -85,6 +86,7 @@ class SpectralRenderer:
         sinks: NDArray[np.float64] | None = None
         trapped = np.zeros(len(self.sensor.leds))
         variance, first = 0.0, None
+        walked: list[NDArray[np.float64]] = []
         for number, (band, leds, renderer) in enumerate(
             zip(self.bands, self._leds, self.renderers, strict=True)
         ):
@@ -95,6 +97,7 @@ class SpectralRenderer:
                     quality=quality,
                     seed=(seed + number * _SEED_STEP) % _SEEDS if number else seed,
                     samples=samples if band.parts == 1 else max(whole // band.parts, 2),
+                    traced=traced[number : number + 1] if traced else None,
                     progress=_part(progress, number, len(self.bands)),
                     **options,
                 )
@@ -117,6 +120,7 @@ class SpectralRenderer:
                 sinks[list(leds)] += band.energy * one.sinks
                 trapped[list(leds)] += band.energy * one.trapped
             first = first or one
+            walked += one.traced or ()
         assert first is not None
         noise = 100.0 * np.sqrt(variance) / max(_mean(radiance), 1e-30)
         return replace(
@@ -125,6 +129,7 @@ class SpectralRenderer:
             noise_percent=float(noise),
             sinks=sinks,
             trapped=None if sinks is None else trapped,
+            traced=tuple(walked) or None,
             seconds=time.perf_counter() - start,
         )
 

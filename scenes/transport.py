@@ -64,11 +64,14 @@ class Light:
         W that end there; "tissue" is what the tissue keeps.
     trapped : (n_led,)
         W that come to the contact surface for the first time beyond the critical angle.
+    traced : (n_led, layers, GRID, GRID)
+        Weighted irradiance of all light that was not gathered, W/mm², all orders together.
     """
 
     upward: Array
     sinks: Array
     trapped: Array
+    traced: Array
 
 
 def survey(scene: mi.Scene, sensor: Sensor) -> Ground:
@@ -137,8 +140,9 @@ def transport(
 
     each = max(samples // 2, 1)
     maps, sinks, trapped, _ = walk(0, each, None)
-    landed = straight + smooth(maps, GRID // trace.CELLS)
-    total = newest = _spread(entrance, behind, ground, landed)
+    traced = smooth(maps, GRID // trace.CELLS)
+    total = newest = _spread(entrance, behind, ground, straight + traced)
+    landed = straight + traced
     ratio = np.ones(n_led)
     for order in range(1, _ORDERS + 1):
         before = newest[:, 0].sum(axis=(1, 2))
@@ -147,13 +151,26 @@ def transport(
         maps, more, _, begun = walk(order, max(each >> min(2 * order, 6), 2), newest)
         sinks = sinks + more
         sinks[:, 0] -= begun
-        newest = _spread(entrance, behind, ground, smooth(maps, GRID // trace.CELLS))
-        total = total + newest
+        landed = smooth(maps, GRID // trace.CELLS)
+        newest = _spread(entrance, behind, ground, landed)
+        total, traced = total + newest, traced + landed
         ratio = newest[:, 0].sum(axis=(1, 2)) / np.maximum(before, 1e-300)
     # each order is like the one before by now: the rest is a geometric series
     ratio = np.clip(ratio, 0.0, 0.9)
-    total = total + newest * (ratio / (1.0 - ratio))[:, None, None, None]
-    return Light(total, sinks, trapped)
+    rest = (ratio / (1.0 - ratio))[:, None, None, None]
+    return Light(total + newest * rest, sinks, trapped, traced + landed * rest)
+
+
+def again(
+    sensor: Sensor, basis: AngularBasis, behind: Behind, ground: Ground, straight: Array, traced: Array
+) -> Array:
+    """Light that goes up in the tissue, `Light.upward`, with the `traced` light of another press.
+
+    What an inclusion changes in it is small: light that has walked far through the guide tells of the whole
+    press, and is 5 % of what enters the contact where LEDs shine in from air.
+    """
+    entrance = Entrance.at(basis, ground.fraction, sensor.guide.width_mm)
+    return _spread(entrance, behind, ground, straight + traced)
 
 
 def _first_leg(led: Led) -> int:

@@ -39,6 +39,13 @@ def take(design: Design, radiance: NDArray[np.floating], seed: int, level: float
     return _expose(design, radiance, seed, _PICTURE, level, design.camera.frames)
 
 
+def expected_counts(design: Design, radiance: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return the mean of `take` without rounding, (rows, columns[, 3]) counts."""
+    from scenes.camera import mean_counts
+
+    return mean_counts(design.camera, _received(design, radiance), design.light.wavelength_nm)
+
+
 def take_reference(
     design: Design, radiance: NDArray[np.floating], seed: int, level: float
 ) -> NDArray[np.float32]:
