@@ -56,8 +56,9 @@ def test_a_workers_memory_stays(tmp_path, monkeypatch):
     kept = run._outcome
 
     def noting(future: object) -> object:
-        made.append(kept(future))
-        return made[-1]
+        outcome = kept(future)
+        made.extend([outcome] if isinstance(outcome, Made) else [])  # not those of shared references
+        return outcome
 
     monkeypatch.setattr(run, "_outcome", noting)
     began = time.perf_counter()
