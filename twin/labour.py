@@ -13,6 +13,7 @@ import gc
 import logging
 import os
 import socket
+import sys
 import threading
 import traceback
 from collections.abc import Callable
@@ -196,6 +197,15 @@ class WrongCorpus(ValueError):
     """A worker that sees no corpus under the run's path, or another one; one line."""
 
 
+def give_back() -> None:
+    """Return memory that nobody uses to the system: Python's, Dr.Jit's and the C library's."""
+    gc.collect()  # cycles of arrays, some tens of MiB between two collections of Python's own
+    if drjit := sys.modules.get("drjit"):
+        drjit.flush_malloc_cache()
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
+
+
 class _Life:
     """How long a worker has worked and how much it has grown; one that has seen enough is replaced."""
 
@@ -205,9 +215,7 @@ class _Life:
     def lived(self, frames: int) -> int:
         """Count some more frames, and return the memory that the process holds, bytes."""
         if (self.frames + frames) // TRIM_FRAMES > self.frames // TRIM_FRAMES:
-            gc.collect()  # cycles of arrays, some tens of MiB between two collections of Python's own
-            with suppress(OSError, AttributeError):
-                ctypes.CDLL(None).malloc_trim(0)
+            give_back()
         self.frames += frames
         held_B = memory_B()
         if self.frames <= YOUNG_FRAMES or not self.young_B:
