@@ -109,19 +109,90 @@ def read_exr(path: StrPath) -> dict[str, NDArray[np.float32]]:
 
     Raises ImageError, in one line, for a file that is missing, not EXR, cut short or damaged.
     """
-    data = _exr_bytes(Path(path))
+    path = Path(path)
+    return {name: plane.astype(np.float32) for name, plane in decode_exr(_read(path), path).items()}
+
+
+def decode_exr(
+    data: bytes, path: StrPath, *, shape: tuple[int, int] | None = None, names: Collection[str] | None = None
+) -> dict[str, NDArray[Any]]:
+    """The planes of an EXR file's bytes as they are stored, half or float, by alphabet; ``path`` names it.
+
+    With ``shape`` and ``names`` the head is looked at first: pixels of another size, or a channel of another
+    name, are refused before anything is unpacked. Raises ImageError in one line.
+    """
+    _check_blocks(data, path, shape, names)
     try:
         found = OpenEXR.File(io.BytesIO(data), separate_channels=True, num_threads=0).channels()
     except (RuntimeError, ValueError) as error:
         raise ImageError(f"{path}: damaged EXR file (pixels cannot be decoded)") from error
-    return {name: np.array(channel.pixels, dtype=np.float32) for name, channel in sorted(found.items())}
+    planes = {name: np.asarray(channel.pixels) for name, channel in sorted(found.items())}
+    for name, plane in planes.items():
+        if shape is not None and (plane.shape != shape or plane.dtype not in (np.float16, np.float32)):
+            what = f"{plane.dtype} {plane.shape}"
+            raise ImageError(f"{path}: channel {name}: received {what}, allowed: half or float {shape}")
+    return planes
 
 
 def read_exr_header(path: StrPath) -> dict[str, str]:
     """The text that `write_exr` kept beside the pixels."""
-    data = _exr_bytes(Path(path))
-    found = OpenEXR.File(io.BytesIO(data), header_only=True, num_threads=0).header()
+    path = Path(path)
+    return decode_exr_header(_read(path), path)
+
+
+def decode_exr_header(data: bytes, path: StrPath) -> dict[str, str]:
+    """The same of a file's bytes; ``path`` names it."""
+    _check_blocks(data, path)
+    try:
+        found = OpenEXR.File(io.BytesIO(data), header_only=True, num_threads=0).header()
+    except (RuntimeError, ValueError) as error:
+        raise ImageError(f"{path}: damaged EXR file (head cannot be read)") from error
     return {key: value for key, value in sorted(found.items()) if key not in _OWN and isinstance(value, str)}
+
+
+def read_exr_text(path: StrPath, most: int = 2**20) -> dict[str, str]:
+    """The text that `write_exr` kept, read from the file's first bytes only: fast, and blind to the pixels.
+
+    Raises ImageError, in one line, for a file that is missing, not EXR, or with a head of more than `most` bytes.
+    """
+    try:
+        with open(path, "rb") as file:
+            data = file.read(2**14)
+            while True:
+                try:
+                    return _head_text(data)
+                except (IndexError, struct.error) as error:
+                    more = file.read(len(data)) if len(data) < most else b""
+                    if not more:
+                        raise ImageError(f"{path}: EXR file is cut short or damaged in its head") from error
+                    data += more
+    except OSError as error:
+        raise ImageError(f"{path}: cannot be read ({error.strerror})") from error
+    except ValueError as error:
+        raise error if isinstance(error, ImageError) else ImageError(f"{path}: {error}") from error
+
+
+def _head_text(data: bytes) -> dict[str, str]:
+    """Text attributes of an EXR head; IndexError or struct.error where the bytes end before it does.
+
+    Layout: OpenEXR file layout, "header".
+    """
+    if not data.startswith(b"\x76\x2f\x31\x01"):
+        raise ValueError("not an EXR file")
+    found, at = {}, 8
+    while data[at] != 0:
+        name, at = _text(data, at)
+        kind, at = _text(data, at)
+        (size,) = struct.unpack_from("<i", data, at)
+        at += 4
+        if size < 0:
+            raise ValueError("damaged EXR file (attribute of negative size)")
+        if at + size >= len(data):
+            raise IndexError(at)
+        if kind == b"string" and name.decode("utf-8", "replace") not in _OWN:
+            found[name.decode()] = data[at : at + size].decode()
+        at += size
+    return found
 
 
 def write_png(path: StrPath, image: NDArray[Any]) -> None:
@@ -146,9 +217,22 @@ def read_png(path: StrPath) -> NDArray[Any]:
 
     Raises ImageError, in one line, for a file that is missing, cut short, not PNG, or neither grey nor RGB.
     """
-    data = _read(Path(path))
+    path = Path(path)
+    return decode_png(_read(path), path)
+
+
+def decode_png(data: bytes, path: StrPath, *, shape: tuple[int, int] | None = None) -> NDArray[Any]:
+    """The same of a PNG file's bytes, refused before it is unpacked where it is not of this (rows, columns).
+
+    ``path`` names the file.
+    """
     if not data.startswith(b"\x89PNG\r\n\x1a\n"):
         raise ImageError(f"{path}: not a PNG file")
+    if shape is not None:
+        # ISO/IEC 15948, 11.2.2: the first chunk is IHDR, and begins with width and height
+        columns, rows = struct.unpack(">II", data[16:24]) if len(data) >= 33 else (0, 0)
+        if data[12:16] != b"IHDR" or (rows, columns) != shape:
+            raise ImageError(f"{path}: received a PNG of {columns} x {rows} pixels, allowed: {_size(shape)}")
     if png.is_deep_colour(data):
         try:
             return png.decode(data)
@@ -194,14 +278,22 @@ def _read(path: Path) -> bytes:
         raise ImageError(f"{path}: cannot be read ({error.strerror})") from error
 
 
-def _exr_bytes(path: Path) -> bytes:
-    """The bytes of a single-part scan-line EXR file, after a look at its table of blocks.
+def _size(shape: tuple[int, int]) -> str:
+    return f"{shape[1]} x {shape[0]}"
+
+
+def _check_blocks(
+    data: bytes,
+    path: StrPath,
+    shape: tuple[int, int] | None = None,
+    names: Collection[str] | None = None,
+) -> None:
+    """Take a look at the head and the table of blocks of a single-part scan-line EXR file.
 
     OpenEXR itself prints to the terminal when a file is cut short; asking first keeps the message to
     one line.
     Layout: OpenEXR file layout, "offset tables" and "scan line blocks".
     """
-    data = _read(path)
     if not data.startswith(b"\x76\x2f\x31\x01"):
         raise ImageError(f"{path}: not an EXR file")
     try:
@@ -214,9 +306,16 @@ def _exr_bytes(path: Path) -> bytes:
             _, at = _text(data, at)
             (size,) = struct.unpack_from("<i", data, at)
             at += 4
+            if size < 0:
+                raise IndexError(at)
             if name == b"dataWindow":
-                _, low, _, high = struct.unpack_from("<4i", data, at)
+                left, low, right, high = struct.unpack_from("<4i", data, at)
                 rows = high - low + 1
+                if shape is not None and (rows, right - left + 1) != shape:
+                    received = f"an EXR of {right - left + 1} x {rows} pixels"
+                    raise ImageError(f"{path}: received {received}, allowed: {_size(shape)}")
+            elif name == b"channels" and names is not None:
+                _check_names(data[at : at + size], path, names)
             elif name == b"compression":
                 block = {0: 1, 1: 1, 2: 1, 3: 16, 4: 32, 5: 16, 6: 32, 7: 32, 8: 32, 9: 256}.get(data[at], 0)
             at += size
@@ -229,7 +328,20 @@ def _exr_bytes(path: Path) -> bytes:
                 raise ImageError(f"{path}: EXR file is cut short ({len(data)} bytes)")
     except (IndexError, struct.error, OverflowError) as error:
         raise ImageError(f"{path}: EXR file is cut short or damaged ({len(data)} bytes)") from error
-    return data
+
+
+def _check_names(channels: bytes, path: StrPath, allowed: Collection[str]) -> None:
+    """Refuse a list of channels with names of others, or one twice; 16 bytes follow each name."""
+    at, seen = 0, set()
+    while channels[at] != 0:
+        name, at = _text(channels, at)
+        text = name.decode("utf-8", "replace")
+        if text not in allowed or text in seen:
+            raise ImageError(
+                f"{path}: channel: received {text[:60]!r}, allowed: each of {sorted(allowed)} once"
+            )
+        seen.add(text)
+        at += 16
 
 
 def _text(data: bytes, at: int) -> tuple[bytes, int]:

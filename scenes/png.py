@@ -40,7 +40,7 @@ def decode(data: bytes) -> NDArray[np.uint16]:
         kind, body = data[at + 4 : at + 8], data[at + 8 : at + 8 + size]
         if len(data) < at + 12 + size or _chunk(kind, body)[-4:] != data[at + 8 + size : at + 12 + size]:
             raise ValueError("damaged PNG file (a part is cut short or its checksum is wrong)")
-        if kind == b"IHDR":
+        if kind == b"IHDR" and not header:  # a second one could promise more pixels than the first
             header = body
         elif kind == b"IDAT":
             packed.append(body)

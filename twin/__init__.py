@@ -14,14 +14,16 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from fem import Inclusion
     from twin.complaint import DesignError
+    from twin.corpus import Corpus
     from twin.design import Design, load_design
     from twin.frame import Frame
     from twin.simulation import simulate
 
-__all__ = ["Design", "DesignError", "Frame", "Inclusion", "load_design", "simulate"]
+__all__ = ["Corpus", "Design", "DesignError", "Frame", "Inclusion", "load_design", "simulate"]
 
 # Loaded when first asked for, so that the program listens for Ctrl-C before anything slow begins.
 _HOME = {
+    "Corpus": "twin.corpus",
     "Design": "twin.design",
     "DesignError": "twin.complaint",
     "Frame": "twin.frame",

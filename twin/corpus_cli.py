@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable
 
 from twin import interrupt
-from twin.complaint import DesignError
+from twin.complaint import DesignError, shown
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -56,4 +56,134 @@ def _plan(arguments: argparse.Namespace) -> int:
     return 0
 
 
-_ACTIONS: dict[str, Callable[[argparse.Namespace], int]] = {"plan": _plan}
+def _run(arguments: argparse.Namespace) -> int:
+    for flag in ("workers", "scheduler"):
+        if getattr(arguments, flag) in (0, ""):
+            raise DesignError(f"--{flag}", shown(getattr(arguments, flag)), "an integer > 0, or nothing")
+    if arguments.workers is not None and arguments.scheduler is not None:
+        raise DesignError("--workers", "it with --scheduler", "one of them")
+    from twin.headway import Headway
+    from twin.run import Stopped, run
+
+    with Headway() as tell:
+        try:
+            state = run(
+                arguments.directory,
+                arguments.workers,
+                arguments.scheduler,
+                retries=arguments.retries,
+                progress=tell,
+            )
+        except Stopped as error:
+            return _failed("run", str(error))
+        except KeyboardInterrupt:
+            tell.close()
+            print(
+                "twin corpus run: interrupted; what is finished stays, run again continues", file=sys.stderr
+            )
+            return 130
+    print(
+        f"{state.done} of {state.planned} samples are there, {state.made} of them new: {arguments.directory}"
+    )
+    for line in state.notes:
+        print(line)
+    if state.failed:
+        return _failed(
+            "run", f"{state.failed} samples failed; twin corpus status {arguments.directory} says why"
+        )
+    return 0
+
+
+def _status(arguments: argparse.Namespace) -> int:
+    from twin.status import as_json, in_words, status
+
+    found = status(arguments.directory)
+    print(as_json(found) if arguments.json else in_words(found))
+    return 0
+
+
+def _verify(arguments: argparse.Namespace) -> int:
+    if arguments.workers == 0:
+        raise DesignError("--workers", "0", "an integer > 0")
+    from twin.reporting import Reporter
+    from twin.run import Stopped
+    from twin.verify import verify
+
+    with Reporter() as report:
+
+        def tell(stage: str, done: float) -> None:
+            interrupt.stop_if_asked()
+            report(stage, done)
+
+        try:
+            found = verify(
+                arguments.directory,
+                resimulate=arguments.resimulate,
+                seed=arguments.seed,
+                workers=arguments.workers,
+                repair=arguments.repair,
+                progress=tell,
+            )
+        except Stopped as error:
+            return _failed("verify", str(error))
+    for line in found.lines:
+        print(line)
+    print(found.summary, flush=True)
+    return 0 if found.good else 1
+
+
+def _export(arguments: argparse.Namespace) -> int:
+    for name, what in (("format", "webdataset, hf or png"), ("out", "the folder to make for the export")):
+        if getattr(arguments, name) is None:
+            raise DesignError(f"--{name}", "nothing", what)
+    from twin.corpus import Corpus
+    from twin.exporting import export
+    from twin.reporting import Reporter
+
+    corpus = Corpus(arguments.directory)
+    with Reporter() as report:
+        written = export(
+            corpus,
+            arguments.out,
+            arguments.format,
+            shape=None if arguments.shape is None else tuple(arguments.shape),
+            shards=arguments.shards,
+            progress=_told(report, "samples"),
+        )
+    size = sum(path.stat().st_size for path in written)
+    print(f"{len(corpus)} samples in {len(written)} files, {size / 1e6:.3g} MB: {arguments.out}")
+    return 0
+
+
+def _card(arguments: argparse.Namespace) -> int:
+    from twin.card import write_card
+    from twin.corpus import Corpus
+    from twin.reporting import Reporter
+
+    with Reporter() as report:
+        written = write_card(Corpus(arguments.directory), _told(report, "figures"))
+    print(f"card: {written[0]}")
+    return 0
+
+
+def _told(report: Callable[[str, float], None], stage: str) -> Callable[[int, int], None]:
+    def tell(done: int, total: int) -> None:
+        interrupt.stop_if_asked()
+        report(stage, done / total)
+
+    return tell
+
+
+def _failed(action: str, line: str) -> int:
+    print(f"twin corpus {action}: {' '.join(line.split())}", file=sys.stderr)
+    return 1
+
+
+_ACTIONS: dict[str, Callable[[argparse.Namespace], int]] = {
+    "plan": _plan,
+    "run": _run,
+    "status": _status,
+    "verify": _verify,
+    "export": _export,
+    "card": _card,
+}

@@ -116,6 +116,12 @@ def lit(plan: Plan, number: int, contacts: list[Contact], seconds: float, corpus
     return {"sample": number, "seconds": took, "bytes": size}
 
 
+def refer(plan: Plan, number: int, level: int, contact: Contact, corpus: Path) -> None:
+    """Make the reference that the sample shares with others, unless it is there; nothing where it shares none."""
+    if plan.shares_references:
+        _reference(plan, number, level, contact, corpus, corpus)
+
+
 @dataclass(frozen=True)
 class _Reference:
     """What the camera sees without inclusion: (rows, columns[, 3]) counts, its file, hashes of its files."""

@@ -15,9 +15,11 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,10 @@ from scenes import exr
 
 SAMPLE = "sample.json"
 PER_FOLDER = 1000  # samples: more entries make some file systems slow
+
+_MOST = 2**20  # bytes of a sample.json
+_FILE = re.compile(r"[0-9]{1,3}(\.reference)?\.(exr|png)|references/[0-9a-f]{16}\.(exr|png)")
+_SHA = re.compile(r"[0-9a-f]{64}")
 
 _FEM = {
     f"fem_{kind}_{name}": ("fem", kind, name)
@@ -116,15 +122,53 @@ def write_frame(path: Path, planes: Mapping[str, NDArray[np.float32]], record: M
 
 
 def read_record(path: Path) -> dict[str, Any]:
-    """Return the record of a frame's EXR. Raises `scenes.exr.ImageError` in one line."""
-    try:
-        record = json.loads(exr.read_exr_header(path)["record"])
+    """Return the record of a frame's EXR, from the file's head alone.
+
+    Raises `scenes.exr.ImageError` in one line.
+    """
+    text = exr.read_exr_text(path).get("record", "")
+    with suppress(ValueError, RecursionError):
+        record = json.loads(text, parse_constant=_refused)
         if isinstance(record, dict):
             return record
-    except (KeyError, ValueError) as error:
-        if isinstance(error, exr.ImageError):
-            raise
     raise exr.ImageError(f"{path}: record: received none that can be read, allowed: that of a frame")
+
+
+@dataclass(frozen=True)
+class Note:
+    """What `sample.json` says: the SHA-256 of the sample's files by name, seconds by stage, the version."""
+
+    sample: int
+    sha256: dict[str, str]
+    seconds: dict[str, float]
+    version: str
+
+
+def read_note(corpus: Path, number: int) -> Note:
+    """Return what a sample's `sample.json` says. Nothing in it is trusted.
+
+    Raises `scenes.exr.ImageError` in one line.
+    """
+    place = sample_folder(corpus, number) / SAMPLE
+    try:
+        with open(place, "rb") as file:
+            data = json.loads(file.read(_MOST + 1)[:_MOST], parse_constant=_refused)
+        hashes = {name: value for name, value in data["sha256"].items() if _FILE.fullmatch(name)}
+        seconds = {name: float(data["seconds"][name]) for name in ("mechanics", "light", "write")}
+        note = Note(int(data["sample"]), hashes, seconds, str(data["versions"]["tsis-twin"])[:100])
+        good = all(isinstance(value, str) and _SHA.fullmatch(value) for value in hashes.values())
+        good = good and all(0.0 <= value < 1e9 for value in seconds.values())
+        if good and len(hashes) == len(data["sha256"]) and note.sample == number and hashes:
+            return note
+    except OSError as error:
+        raise exr.ImageError(f"{place}: cannot be read ({error.strerror})") from error
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError):
+        pass
+    raise exr.ImageError(f"{place}: received what cannot be read, allowed: what `twin corpus run` wrote")
+
+
+def _refused(name: str) -> None:
+    raise ValueError(name)
 
 
 def row_of(record: Mapping[str, Any]) -> dict[str, Any]:
