@@ -1,0 +1,370 @@
+"""`twin replicate`: the paper's numbers from a corpus, beside what the paper printed.
+
+Everything is a function of the corpus, the seed and the settings below; what is simulated on the way (2-D
+solutions, one cut for Fig. 4) is deterministic. Estimates of a phantom are means over the repeats.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation import paper
+from twin import inversion, thresholds
+from twin.earlier import Earlier, earlier
+from twin.inversion import Scalars, Variant
+
+if TYPE_CHECKING:
+    from twin.corpus import Corpus
+
+Floats = NDArray[np.float64]
+
+MAIN_MM = 2.0
+"""Press level of the main tables, where the corpus has it: the paper gives none."""
+
+LARGE = np.array([1, 2, 3, 4, 5, 6, 7, 8])
+"""Places in Table I of the phantoms of 7 mm and more."""
+
+GOAL = {"size_mm": 0.6, "depth_mm": 0.8}
+"""Root mean squared errors, mm, that three scalars should reach on the large phantoms."""
+
+VARIANTS = (
+    inversion.PLAIN,
+    Variant("paper-phantoms", "the same, lines through the nine phantoms as the paper did", source="phantoms"),
+    Variant("paper-logs", "a line per scalar, network on logarithms", logs=True),
+    Variant("paper-split", "a line per scalar, E with a network of its own", split=True),
+    Variant("joint", "each surface scalar linear in all three of the picture, network on surface scalars", "joint"),
+    Variant("joint-split", "the same, E with a network of its own", "joint", split=True),
+    Variant("joint-logs-split", "the same between logarithms", "joint", logs=True, split=True),
+    Variant("picture", "no mapping: network trained on the picture's scalars", "network"),
+    Variant("picture-split", "the same, E with a network of its own", "network", split=True),
+    Variant("picture-logs-split", "the same on logarithms", "network", logs=True, split=True),
+    Variant("surface", "no picture: the network is asked with the surface's true scalars", "none"),
+    Variant("surface-logs-split", "the same on logarithms, E with a network of its own", "none", logs=True, split=True),
+)
+
+CANDIDATES = tuple(one.name for one in VARIANTS if one.mapping != "none" and one.source == "box")
+"""Chains that `chosen` is taken from: what can be asked of an unknown inclusion's picture."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One chain on the nine phantoms.
+
+    Attributes
+    ----------
+    variant : which.
+    protocol : "125/9" or "leave-one-out".
+    level_mm : nominal press levels whose scalars it takes.
+    k_dn : threshold of the picture, counts.
+    estimate : (9, 3) mean over the repeats.
+    spread : (9, 3) standard deviation over the repeats.
+    """
+
+    variant: Variant
+    protocol: str
+    level_mm: tuple[float, ...]
+    k_dn: float
+    estimate: Floats
+    spread: Floats
+
+
+@dataclass(frozen=True)
+class Crossed:
+    """One chain on the random inclusions, cross-validated.
+
+    Attributes
+    ----------
+    estimate, truth : (n, 3).
+    rmse : (3,) over those of 4 mm and more.
+    half_width : (3,) of an interval around the estimate that holds 90 % of these truths.
+    explained : (3,) share of the variance that the estimates explain, below 0 where worse than the mean.
+    """
+
+    variant: Variant
+    level_mm: tuple[float, ...]
+    k_dn: float
+    estimate: Floats
+    truth: Floats
+    rmse: Floats
+    half_width: Floats
+    explained: Floats
+
+
+@dataclass(frozen=True)
+class Replication:
+    """All that the report tells.
+
+    Attributes
+    ----------
+    trained : random inclusions that networks are trained on.
+    repeats, seed : of the networks.
+    main_mm : press level of the main tables.
+    k_dn, low_k_dn : the design's threshold, and the lowest that noise allows.
+    noise_dn : of a pixel of the tared picture, standard deviation.
+    levels : (level's mm, k) to its scalars.
+    runs : all chains on the phantoms.
+    crossed : chains on the random inclusions, main level, both thresholds.
+    chosen : the chain (and k) that did best on the random inclusions.
+    earlier : the methods before the paper.
+    """
+
+    trained: int
+    repeats: int
+    seed: int
+    main_mm: float
+    k_dn: float
+    low_k_dn: float
+    noise_dn: float
+    levels: dict[tuple[float, float], Scalars]
+    runs: list[Run] = field(default_factory=list)
+    crossed: list[Crossed] = field(default_factory=list)
+    chosen: tuple[str, float] = ("paper", 0.0)
+    earlier: list[Earlier] = field(default_factory=list)
+
+    def run(self, name: str, protocol: str, level_mm: Sequence[float], k_dn: float) -> Run:
+        """Return one of the runs."""
+        key = (name, protocol, tuple(level_mm), k_dn)
+        return next(r for r in self.runs if (r.variant.name, r.protocol, r.level_mm, r.k_dn) == key)
+
+    def best(self) -> Crossed:
+        """Return what `chosen` did on the random inclusions."""
+        return next(c for c in self.crossed if (c.variant.name, c.k_dn) == self.chosen)
+
+
+def replicate(
+    corpus: Corpus,
+    *,
+    repeats: int = 100,
+    seed: int = 0,
+    progress: Callable[[str, float], None] | None = None,
+) -> Replication:
+    """Run the paper's chain, its variants and its predecessors on a corpus with the nine phantoms.
+
+    Raises
+    ------
+    DesignError
+        In one line, if the corpus has no phantoms or too few other samples.
+    """
+    tell = progress or (lambda stage, done: None)
+    depths = corpus.indentation_mm
+    main = int(np.argmin([abs(depth - MAIN_MM) for depth in depths]))
+    source = str(corpus.path)
+    k = corpus.design.signal.counts
+    first = [inversion.scalars_of(corpus.table, step, mm, source) for step, mm in enumerate(depths)]
+    noise, low, lowered = _lowered(corpus, first, main, tell)
+    levels = {(data.level_mm[0], k): data for data in first} | {(d.level_mm[0], low): d for d in lowered}
+    found = Replication(
+        trained=len(first[main].box),
+        repeats=repeats,
+        seed=seed,
+        main_mm=depths[main],
+        k_dn=k,
+        low_k_dn=low,
+        noise_dn=noise,
+        levels=levels,
+    )
+    ks = list(dict.fromkeys((k, low)))
+    for number, one in enumerate(ks):
+        for place, name in enumerate(CANDIDATES):
+            found.crossed.append(cross(levels[depths[main], one], _variant(name), one, seed))
+            tell("cross-validation", (number * len(CANDIDATES) + place + 1) / (len(ks) * len(CANDIDATES)))
+    best = min(found.crossed, key=lambda one: float(((one.rmse / one.truth.std(axis=0))[:2] ** 2).sum()))
+    found = replace(found, chosen=(best.variant.name, best.k_dn))
+    _run_all(found, ks, tell)
+    guesses = earlier(
+        corpus,
+        main,
+        first[main].sample[first[main].phantoms],
+        levels[depths[main], low].picture[first[main].phantoms],
+        repeats=repeats,
+        seed=seed,
+        progress=lambda done: tell("earlier methods", done),
+    )
+    return replace(found, earlier=guesses)
+
+
+def cross(data: Scalars, variant: Variant, k_dn: float, seed: int) -> Crossed:
+    """Cross-validate a chain on the random inclusions."""
+    truth = data.truth[data.box]
+    guess = inversion.crossed(data, variant, seed=seed)
+    off = guess - truth
+    large = truth[:, 0] >= 4.0
+    return Crossed(
+        variant=variant,
+        level_mm=data.level_mm,
+        k_dn=k_dn,
+        estimate=guess,
+        truth=truth,
+        rmse=np.sqrt((off[large] ** 2).mean(axis=0)),
+        half_width=np.quantile(np.abs(off), 0.9, axis=0, method="higher"),
+        explained=1.0 - (off**2).mean(axis=0) / truth.var(axis=0),
+    )
+
+
+def _run_all(found: Replication, ks: Sequence[float], tell: Callable[[str, float], None]) -> None:
+    """All chains at the main level by 125/9; the plain and the chosen one by both protocols at every level."""
+    depths = sorted({mm for mm, _ in found.levels})
+    name, k_best = found.chosen
+    todo: list[tuple[Variant, bool, tuple[float, ...], float]] = []
+    for k in ks:
+        todo += [(variant, False, (found.main_mm,), k) for variant in VARIANTS]
+        todo += [(_variant(one), True, (found.main_mm,), k) for one in ("paper", "paper-phantoms")]
+    todo.append((_variant(name), True, (found.main_mm,), k_best))
+    for mm in depths:
+        todo += [(inversion.PLAIN, False, (mm,), k) for k in ks]
+        todo.append((_variant(name), False, (mm,), k_best))
+    if len(depths) > 1:
+        todo += [(_variant(name), False, tuple(depths), k_best)]
+    todo = list(dict.fromkeys(todo))
+    networks: dict[tuple[object, ...], Any] = {}
+    for place, (variant, left_out, mm, k) in enumerate(todo):
+        data = inversion.beside([found.levels[one, k] for one in mm])
+        cache = networks if variant.mapping != "network" else None  # its networks know k
+        every = inversion.estimate(
+            data, variant, left_out=left_out, repeats=found.repeats, seed=found.seed, cache=cache
+        )
+        protocol = "leave-one-out" if left_out else "125/9"
+        found.runs.append(Run(variant, protocol, mm, k, every.mean(axis=0), every.std(axis=0)))
+        tell("networks", (place + 1) / len(todo))
+
+
+def _lowered(
+    corpus: Corpus, first: Sequence[Scalars], main: int, tell: Callable[[str, float], None]
+) -> tuple[float, float, list[Scalars]]:
+    """Noise of a pixel, the lowest whole k that it allows, and the scalars at that k."""
+    samples = first[main].sample
+    probe = thresholds.sweep(corpus, main, most=15, surface=False, samples=samples)
+    low = min(float(np.ceil(thresholds.SIGMAS * probe.noise_dn)), corpus.design.signal.counts)
+    if low >= corpus.design.signal.counts:
+        return probe.noise_dn, corpus.design.signal.counts, list(first)
+    found = []
+    for step, data in enumerate(first):
+        swept = thresholds.sweep(
+            corpus,
+            step,
+            most=len(samples),
+            picture_k=[low],
+            surface=False,
+            samples=data.sample,
+            progress=lambda done, total, step=step: tell("pictures", (step + done / total) / len(first)),
+        )
+        picture = np.column_stack([swept.max_dn[:, 0], data.picture[:, 1], swept.area_px[:, 0]])
+        found.append(replace(data, picture=picture))
+    return probe.noise_dn, low, found
+
+
+def _variant(name: str) -> Variant:
+    return next(one for one in VARIANTS if one.name == name)
+
+
+def figures_of(truth: Floats, estimate: Floats, places: Sequence[int] | None = None) -> dict[str, list[float]]:
+    """Return MAE, RMSE and bias, three numbers each, over all nine phantoms or some."""
+    some = np.arange(len(truth)) if places is None else np.asarray(places)
+    found = paper.errors(truth[some], estimate[some])
+    return {"mae": found.mae.tolist(), "rmse": found.rmse.tolist(), "bias": found.bias.tolist()}
+
+
+def as_json(found: Replication) -> dict[str, Any]:
+    """Return every number of the replication, under names that stay."""
+    truth, published = paper.true_inclusions(), paper.published_estimates()
+    prior, mean = paper.constant(truth, paper.prior_mean()), paper.constant(truth)
+
+    def both(estimate: Floats) -> dict[str, Any]:
+        return {"all": figures_of(truth, estimate), "large": figures_of(truth, estimate, LARGE.tolist())}
+
+    best = best_modulus(found)
+    return {
+        "parameters": list(paper.PARAMETERS),
+        "paper": {
+            "table1": truth,
+            "table2": published,
+            "table3_printed": paper.published_errors(),
+            "recomputed": both(published),
+        },
+        "constants": {"prior_mean": both(prior), "mean_of_the_nine": both(mean)},
+        "trained": found.trained,
+        "repeats": found.repeats,
+        "seed": found.seed,
+        "main_mm": found.main_mm,
+        "k_dn": found.k_dn,
+        "low_k_dn": found.low_k_dn,
+        "noise_dn": found.noise_dn,
+        "chosen": {"variant": found.chosen[0], "k_dn": found.chosen[1]},
+        "runs": [
+            {
+                "variant": run.variant.name,
+                "words": run.variant.words,
+                "protocol": run.protocol,
+                "level_mm": list(run.level_mm),
+                "k_dn": run.k_dn,
+                "estimate": run.estimate,
+                "spread": run.spread,
+                **both(run.estimate),
+            }
+            for run in found.runs
+        ],
+        "earlier": [
+            {"name": one.name, "words": one.words, "estimate": one.estimate, **both(one.estimate)}
+            for one in found.earlier
+        ],
+        "cross_validated": [
+            {
+                "variant": one.variant.name,
+                "level_mm": list(one.level_mm),
+                "k_dn": one.k_dn,
+                "rmse_from_4_mm": one.rmse,
+                "half_width_90": one.half_width,
+                "explained": one.explained,
+            }
+            for one in found.crossed
+        ],
+        "modulus": {
+            "half_width_90_kPa": best.half_width[2],
+            "explained": best.explained[2],
+            "words": worth_of_modulus(found),
+        },
+        "goal": goal(found),
+    }
+
+
+def goal(found: Replication) -> dict[str, Any]:
+    """Return whether the chosen chain, by 125/9 at the main level, does what three scalars should."""
+    name, k = found.chosen
+    run = found.run(name, "125/9", (found.main_mm,), k)
+    reached = paper.rmse(paper.true_inclusions()[LARGE], run.estimate[LARGE])
+    plain = found.run("paper", "125/9", (found.main_mm,), found.k_dn)
+    first = paper.rmse(paper.true_inclusions()[LARGE], plain.estimate[LARGE])
+    return {
+        "rmse_mm": {key: float(reached[i]) for i, key in enumerate(GOAL)},
+        "plain_rmse_mm": {key: float(first[i]) for i, key in enumerate(GOAL)},
+        "allowed_mm": GOAL,
+        "met": all(reached[i] <= limit for i, limit in enumerate(GOAL.values())),
+        "met_by_the_plain_chain": all(first[i] <= limit for i, limit in enumerate(GOAL.values())),
+    }
+
+
+def best_modulus(found: Replication) -> Crossed:
+    """Return what did best on E of the random inclusions."""
+    return max(found.crossed, key=lambda one: float(one.explained[2]))
+
+
+def worth_of_modulus(found: Replication) -> str:
+    """Say plainly what the estimated modulus is worth, from the random inclusions."""
+    best = best_modulus(found)
+    half, share = float(best.half_width[2]), float(best.explained[2])
+    prior = float(np.quantile(np.abs(best.truth[:, 2] - best.truth[:, 2].mean()), 0.9))
+    if share < 0.1:
+        verdict = "it is worth nothing: the mean of the training set does as well"
+    elif share < 0.5:
+        verdict = "it tells soft from stiff at best"
+    else:
+        verdict = "it is an estimate"
+    return (
+        f"E from three scalars, best of all chains on random inclusions: 90 % lie within ±{half:.0f} kPa of the estimate, "
+        f"within ±{prior:.0f} kPa of a constant; it explains {100 * max(share, 0.0):.0f} % of the variance: {verdict}."
+    )
