@@ -1,4 +1,5 @@
-"""The command line: ``twin demo``, ``simulate``, ``check``, ``export``, ``emulate``, ``corpus``, ``schema``.
+"""The command line: ``twin demo``, ``simulate``, ``check``, ``export``, ``emulate``, ``corpus``,
+``map``, ``replicate``, ``schema``.
 
 Exit status 0: done; 1: the machine failed (a full disk); 2: bad input, one line on stderr; 130: interrupted.
 Nothing slow is imported until the input has been checked.
@@ -55,6 +56,7 @@ _FLAGS = {
     "out": "--out",
     "device": "--device",
     "count": "--count",
+    "corpus": "CORPUS",
 }
 
 
@@ -122,6 +124,10 @@ def _run(arguments: argparse.Namespace) -> int:
         from twin import corpus_cli
 
         return corpus_cli.run(arguments)
+    elif arguments.verb in ("map", "replicate"):
+        from twin import study_cli
+
+        return study_cli.run(arguments)
     else:
         parse(["--help"])
     return 0
