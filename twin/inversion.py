@@ -41,6 +41,9 @@ PICTURE = ("tsis_tared_max_dn", "tsis_tared_total_dn", "tsis_tared_area_px")
 FEWEST = 12
 """Random inclusions that a network is trained on, at least."""
 
+SPOT_PX = 9
+"""Pixels above k that make a spot: as many as the maximum is the mean of."""
+
 Mapping = Literal["lines", "joint", "network", "none"]
 Source = Literal["box", "phantoms"]
 
@@ -73,8 +76,8 @@ class Scalars:
 
     @property
     def seen(self) -> NDArray[np.bool_]:
-        """(n,) whether any pixel of the (first) picture is above k."""
-        return np.asarray(self.picture[:, 2] > 0)
+        """(n,) whether the (first) picture shows a spot."""
+        return np.asarray(self.picture[:, 2] >= SPOT_PX)
 
 
 def scalars_of(table: pandas.DataFrame, level: int, level_mm: float, source: str = "corpus") -> Scalars:
@@ -151,28 +154,41 @@ PLAIN = Variant("paper", "the paper's chain: a line per scalar, network on surfa
 def mapped(data: Scalars, variant: Variant, rows: Ints) -> Callable[[ArrayLike], Floats]:
     """Return the map from pictures' scalars (m, p) to the network's inputs (m, p), fitted to some samples.
 
-    Lines of the maximum and the area are fitted to the samples that have a pixel above k; surface on picture
-    as in Fig. 5 turned round: the line of the graph, read backwards. Nothing is below zero.
+    A line per scalar: picture on surface as in Fig. 5, read backwards; nothing is below zero. Joint: least
+    squares of the surface's scalars on all of the picture's, each sample weighted by one over the surface's
+    scalar, so that relative errors count; between logarithms unweighted. Maximum and area, and all of a joint
+    map, are fitted to samples that are seen (`SPOT_PX`).
     """
-    picture, surface = data.picture[rows], data.surface[rows]
     if variant.mapping == "joint":
-        matrix = np.column_stack([np.ones(len(rows)), _scale(variant, picture, data.picture)])
-        found = np.linalg.lstsq(matrix, _scale(variant, surface, data.surface), rcond=None)[0]
-        return lambda asked: (
-            np.column_stack([np.ones(len(np.asarray(asked))), _scale(variant, np.asarray(asked), data.picture)])
-            @ found
-        )
+        return _jointly(data, variant, rows[(data.picture[rows, 2::3] >= SPOT_PX).all(axis=1)])
+    picture, surface = data.picture[rows], data.surface[rows]
     lines = []
     for column in range(picture.shape[1]):
         area = picture[:, 3 * (column // 3) + 2]
-        there = np.ones(len(rows), bool) if column % 3 == 1 else area > 0
+        there = np.ones(len(rows), bool) if column % 3 == 1 else area >= SPOT_PX
         lines.append(fit_line(surface[there, column], picture[there, column]))
-    floor = np.zeros(surface.shape[1])
 
     def back(asked: ArrayLike) -> Floats:
         given = np.asarray(asked, np.float64)
         found = np.stack([line.inverse(given[:, i]) for i, line in enumerate(lines)], axis=1)
-        return _scale(variant, np.maximum(found, floor), data.surface)
+        return _scale(variant, np.maximum(found, 0.0), data.surface)
+
+    return back
+
+
+def _jointly(data: Scalars, variant: Variant, rows: Ints) -> Callable[[ArrayLike], Floats]:
+    def matrix(picture: Floats) -> Floats:
+        return np.column_stack([np.ones(len(picture)), _scale(variant, picture, data.picture)])
+
+    x, y = matrix(data.picture[rows]), _scale(variant, data.surface[rows], data.surface)
+    unit = np.ones_like(y) if variant.logs else np.maximum(y, _lift(data.surface))
+    found = np.stack(
+        [np.linalg.lstsq(x / unit[:, [j]], y[:, j] / unit[:, j], rcond=None)[0] for j in range(y.shape[1])], axis=1
+    )
+
+    def back(asked: ArrayLike) -> Floats:
+        told = matrix(np.asarray(asked, np.float64)) @ found
+        return told if variant.logs else np.maximum(told, 0.0)
 
     return back
 
@@ -228,8 +244,8 @@ def crossed(
     data: Scalars,
     variant: Variant,
     *,
-    folds: int = 10,
-    repeats: int = 8,
+    folds: int = 5,
+    repeats: int = 6,
     seed: int = 0,
     settings: Settings | None = None,
 ) -> Floats:
@@ -286,8 +302,12 @@ def _networks(
 
 
 def _scale(variant: Variant, values: Floats, all_of: Floats) -> Floats:
-    """Logarithms, where they are wanted, of values lifted by a hundredth of their median over the corpus."""
+    """Logarithms, where they are wanted, of values lifted by `_lift`."""
     if not variant.logs:
         return np.asarray(values, np.float64)
-    lift = 0.01 * np.maximum(np.median(np.abs(all_of), axis=0), 1e-12)
-    return np.asarray(np.log(np.maximum(values, 0.0) + lift))
+    return np.asarray(np.log(np.maximum(values, 0.0) + _lift(all_of)))
+
+
+def _lift(all_of: Floats) -> Floats:
+    """A hundredth of the median over the corpus, (p,)."""
+    return 0.01 * np.maximum(np.median(np.abs(all_of), axis=0), 1e-12)
