@@ -42,15 +42,21 @@ _QUALITY = "preview"
 GUESSES = (
     "2-D is taken as plane strain: probe, slab and inclusion are infinite along y, the sphere is a cylinder; "
     "linear elasticity, the same layers, slab and press level as ours.",
-    f"[9] is a table of {_TABLES['[9]']} x {_TABLES['[9]']} and [10] one of {_TABLES['[10]']} x {_TABLES['[10]']} "
-    f"pairs (d, h) over the paper's box, the inclusion {STIFF:g} times as stiff as the tissue; E is not estimated.",
-    "A round Gaussian on a slanted background is fitted to the tared picture, a Gaussian on a constant to the tared "
-    "line of displacements; amplitude and width are looked up in the table by least squares, each weighted with its "
+    f"[9] is a table of {_TABLES['[9]']} x {_TABLES['[9]']} and [10] one of {_TABLES['[10]']} x "
+    f"{_TABLES['[10]']} "
+    f"pairs (d, h) over the paper's box, the inclusion {STIFF:g} times as stiff as the tissue; E is not "
+    f"estimated.",
+    "A round Gaussian on a slanted background is fitted to the tared picture, a Gaussian on a constant to "
+    "the tared "
+    "line of displacements; amplitude and width are looked up in the table by least squares, each weighted "
+    "with its "
     "spread over the table.",
-    "Counts are turned into mm, and the picture's width into the line's, by one line each through the nine phantoms "
+    "Counts are turned into mm, and the picture's width into the line's, by one line each through the nine "
+    "phantoms "
     "and their own 2-D solutions, leaving out the phantom that is estimated: without it a plane model's "
     "amplitude and a picture's have no common scale.",
-    f"[11] is a network as in our chain on the three scalars of {_FEW} random inclusions of the paper's box, in plane "
+    f"[11] is a network as in our chain on the three scalars of {_FEW} random inclusions of the paper's "
+    f"box, in plane "
     "strain (total and area per mm of width), mapped by a line each through the other eight phantoms.",
 )
 
@@ -91,7 +97,7 @@ def earlier(
     bumps = [fit_bump(grey(corpus.tared(int(one), [level])[0]), pixel) for one in np.asarray(samples)]
     shapes = np.array([[bump.amplitude, bump.sigma_mm] for bump in bumps])
     tell(0.1)
-    rigid = STIFF * design.slab().modulus
+    rigid = STIFF * design.slab().modulus_kPa
     own = np.array([_shape(plane(design, (d, h, rigid), indentation)) for d, h, _ in truth])
     found = []
     for name, side in _TABLES.items():

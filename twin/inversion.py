@@ -84,7 +84,9 @@ def scalars_of(table: pandas.DataFrame, level: int, level_mm: float, source: str
     """Take a press level out of an index. Raises `DesignError` if what is needed is not there."""
     missing = [name for name in (*SURFACE, *PICTURE) if name not in table.columns]
     if missing:
-        raise DesignError("index.parquet", f"no column {missing[0]}", "the scalars of surface and picture", source=source)
+        raise DesignError(
+            "index.parquet", f"no column {missing[0]}", "the scalars of surface and picture", source=source
+        )
     rows = table[(table["level"] == level) & ~table["blank"]]
     truth = rows[list(paper.PARAMETERS)].to_numpy(np.float64)
     wanted = paper.true_inclusions()
@@ -93,8 +95,12 @@ def scalars_of(table: pandas.DataFrame, level: int, level_mm: float, source: str
         (found,) = np.nonzero(np.abs(truth - one).max(axis=1) < 1e-6)
         if not len(found):
             size, depth, modulus = one
-            received = f"no sample of {size:g} mm, {depth:g} mm deep, {modulus:g} kPa (Table I, number {number})"
-            raise DesignError("corpus", received, "the nine phantoms of the paper (twin corpus plan paper)", source=source)
+            received = (
+                f"no sample of {size:g} mm, {depth:g} mm deep, {modulus:g} kPa (Table I, number {number})"
+            )
+            raise DesignError(
+                "corpus", received, "the nine phantoms of the paper (twin corpus plan paper)", source=source
+            )
         at.append(int(found[0]))
     if len(rows) - 9 < FEWEST:
         received = f"{max(len(rows) - 9, 0)} samples besides the phantoms"
@@ -183,7 +189,8 @@ def _jointly(data: Scalars, variant: Variant, rows: Ints) -> Callable[[ArrayLike
     x, y = matrix(data.picture[rows]), _scale(variant, data.surface[rows], data.surface)
     unit = np.ones_like(y) if variant.logs else np.maximum(y, _lift(data.surface))
     found = np.stack(
-        [np.linalg.lstsq(x / unit[:, [j]], y[:, j] / unit[:, j], rcond=None)[0] for j in range(y.shape[1])], axis=1
+        [np.linalg.lstsq(x / unit[:, [j]], y[:, j] / unit[:, j], rcond=None)[0] for j in range(y.shape[1])],
+        axis=1,
     )
 
     def back(asked: ArrayLike) -> Floats:
@@ -207,9 +214,7 @@ def queries(data: Scalars, variant: Variant, asked: Ints, left_out: bool) -> Flo
     rows = data.box if variant.source == "box" else data.phantoms
     if not left_out:
         return mapped(data, variant, rows)(data.picture[asked])
-    return np.vstack(
-        [mapped(data, variant, rows[rows != one])(data.picture[[one]]) for one in asked]
-    )
+    return np.vstack([mapped(data, variant, rows[rows != one])(data.picture[[one]]) for one in asked])
 
 
 def estimate(
@@ -269,7 +274,7 @@ def crossed(
         for targets in variant.targets:
             y = data.truth[kept][:, targets]
             members = train(x[kept], y, repeats=repeats, seed=seed, settings=settings)
-            found[np.ix_(held, targets)] = members.predict(asked).mean(axis=0)
+            found[held[:, None], list(targets)] = members.predict(asked).mean(axis=0)
     return found
 
 

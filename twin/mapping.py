@@ -115,7 +115,9 @@ def _numbers(fit: Adequacy | None, normal: Line | None) -> dict[str, Any]:
     span = None if line is None or fit is None else line.left_out_rmse / fit.error
     for name in ("linear", "quadratic", "monotone"):
         found[f"left_out_{name}_percent"] = None if fit is None else 100.0 * fit.left_out[name] / (span or 1)
-    found["left_out_surface"] = None if line is None or not line.slope else line.left_out_rmse / abs(line.slope)
+    found["left_out_surface"] = (
+        None if line is None or not line.slope else line.left_out_rmse / abs(line.slope)
+    )
     found |= {
         "residual_sd": None if line is None else line.residual_sd,
         "p_bend": None if fit is None else fit.p,

@@ -20,7 +20,11 @@ if TYPE_CHECKING:
 
 _WORDS = {"max": "maximum", "total": "total", "area": "area"}
 _SURFACE = {"max": "surface's maximum, µm", "total": "surface's total, mm³", "area": "surface's area, mm²"}
-_PICTURE = {"max": "picture's maximum, counts", "total": "picture's total, 10⁶ counts", "area": "picture's area, 10³ px"}
+_PICTURE = {
+    "max": "picture's maximum, counts",
+    "total": "picture's total, 10⁶ counts",
+    "area": "picture's area, 10³ px",
+}
 _MANY = 800  # points above which dots become pixels in the page
 _COLOURS = (BLUE, RED, GREEN)
 
@@ -33,7 +37,16 @@ def scatter(one: One) -> Figure:
         dots = _dots(axis, one, mapped, mapped.y) or dots
         _name(axis, mapped, letter)
         if mapped.fit is None:
-            axis.text(0.5, 0.5, mapped.why, ha="center", va="center", transform=axis.transAxes, fontsize=8.5, wrap=True)
+            axis.text(
+                0.5,
+                0.5,
+                mapped.why,
+                ha="center",
+                va="center",
+                transform=axis.transAxes,
+                fontsize=8.5,
+                wrap=True,
+            )
             continue
         across = np.linspace(mapped.x.min(), mapped.x.max(), 100)
         low, high = mapped.fit.line.fit.prediction(across)
@@ -92,15 +105,22 @@ def levels(maps: Sequence[Mapped]) -> Figure:
                 if axis is axes[2] and kind == "raw" and pair.name == "max":
                     continue  # a slope of a scatter: it would squeeze the others
                 axis.plot(at, values, dash, marker="o", ms=4.5, color=colour, lw=1.4)
-    for axis, words in zip(axes, ("R²", "leave-one-out error, % of span", "slope over that of the shallowest"), strict=True):
+    for axis, words in zip(
+        axes, ("R²", "leave-one-out error, % of span", "slope over that of the shallowest"), strict=True
+    ):
         axis.set_xlabel("press, mm")
         axis.set_ylabel(words)
         axis.set_xticks(sorted({one.level_mm for one in maps}))
     axes[0].set_ylim(-0.03, 1.03)
     axes[1].set_ylim(bottom=0)
     axes[1].axhline(5.0, color=GREY, lw=0.9, ls=":")
-    handles = [Line2D([], [], color=c, lw=2, label=_WORDS[pair.name]) for pair, c in zip(PAIRS, _COLOURS, strict=True)]
-    handles += [Line2D([], [], color=INK, ls=dash, label=kind) for kind, dash in (("tared", "-"), ("raw", "--"))]
+    handles = [
+        Line2D([], [], color=c, lw=2, label=_WORDS[pair.name])
+        for pair, c in zip(PAIRS, _COLOURS, strict=True)
+    ]
+    handles += [
+        Line2D([], [], color=INK, ls=dash, label=kind) for kind, dash in (("tared", "-"), ("raw", "--"))
+    ]
     figure.legend(handles=handles, loc="outside upper left", ncols=5, frameon=False, fontsize=8.5)
     return figure
 
@@ -113,7 +133,15 @@ def thresholds(one: One) -> Figure:
     axes[0].set_ylabel("inclusions unseen, %")
     axes[0].set_ylim(-2, 102)
     for name, colour in (("max", BLUE), ("area", GREEN)):
-        axes[1].plot(at, [getattr(k, f"r2_{name}") for k in one.ks], "o-", color=colour, ms=4.5, lw=1.4, label=_WORDS[name])
+        axes[1].plot(
+            at,
+            [getattr(k, f"r2_{name}") for k in one.ks],
+            "o-",
+            color=colour,
+            ms=4.5,
+            lw=1.4,
+            label=_WORDS[name],
+        )
         axes[2].plot(at, [getattr(k, f"error_{name}") for k in one.ks], "o-", color=colour, ms=4.5, lw=1.4)
     axes[1].set_ylabel("R² of the line")
     axes[1].set_ylim(-0.03, 1.03)
@@ -125,7 +153,9 @@ def thresholds(one: One) -> Figure:
         axis.set_xlabel("threshold k of the picture, counts")
         axis.axvline(SIGMAS * one.swept.noise_dn, color=GREY, lw=1, ls=":")
         axis.axvline(design, color=RED, lw=1, ls="-", alpha=0.6)
-    axes[0].annotate("the design's k", (design, 60), xytext=(4, 0), textcoords="offset points", fontsize=8, color=RED)
+    axes[0].annotate(
+        "the design's k", (design, 60), xytext=(4, 0), textcoords="offset points", fontsize=8, color=RED
+    )
     return figure
 
 
@@ -138,7 +168,16 @@ def compared(found: Sequence[One]) -> Figure:
         colour = colormaps["tab10"](number % 10)
         for axis, mapped, letter in zip(axes, one.shown(), "abc", strict=True):
             _name(axis, mapped, letter)
-            axis.plot(mapped.x, mapped.y, "o", ms=3, mew=0, alpha=0.45, color=colour, rasterized=len(mapped.x) > _MANY)
+            axis.plot(
+                mapped.x,
+                mapped.y,
+                "o",
+                ms=3,
+                mew=0,
+                alpha=0.45,
+                color=colour,
+                rasterized=len(mapped.x) > _MANY,
+            )
             if mapped.fit is not None:
                 ends = np.array([mapped.x.min(), mapped.x.max()])
                 axis.plot(ends, mapped.fit.line(ends), color=colour, lw=1.8)

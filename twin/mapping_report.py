@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -76,11 +77,13 @@ def study(
         swept = sweep(
             corpus,
             step,
-            progress=lambda done, total, number=number: tell("pictures", (number + done / total) / len(corpora)),
+            progress=partial(_tell_part, tell, number, len(corpora)),
         )
         rows = [corpus.row(int(sample), step) for sample in swept.sample]
-        columns = [corpus.table[f"fem_tared_{name}"].to_numpy(np.float64)[rows] for name in ("max_mm", "area_mm2")]
-        ks = at_thresholds(swept, *columns, corpus.shape[0] * corpus.shape[1])
+        columns = [
+            corpus.table[f"fem_tared_{name}"].to_numpy(np.float64)[rows] for name in ("max_mm", "area_mm2")
+        ]
+        ks = at_thresholds(swept, columns[0], columns[1], corpus.shape[0] * corpus.shape[1])
         table = corpus.table.iloc[:: corpus.levels]
         depth = dict(zip(table["sample"].tolist(), table["depth_mm"].tolist(), strict=True))
         lines = verdict(maps, kind, level, ks, swept.noise_dn, corpus.design.signal.counts)
@@ -88,14 +91,21 @@ def study(
     return found
 
 
+def _tell_part(tell: Callable[[str, float], None], part: int, parts: int, done: int, total: int) -> None:
+    tell("pictures", (part + done / total) / parts)
+
+
 def differences(corpora: Sequence[Corpus]) -> list[list[str]]:
     """Return the fields of the designs that are not the same: name, and the value in each corpus."""
     flat = [_flat(TypeAdapter(Design).dump_python(corpus.design, mode="json")) for corpus in corpora]
     rest: list[dict[str, Any]] = [
-        {"mechanics of the plan": c.plan.mechanics, "quality": c.plan.quality, "light": c.plan.light} for c in corpora
+        {"mechanics of the plan": c.plan.mechanics, "quality": c.plan.quality, "light": c.plan.light}
+        for c in corpora
     ]
     flat = [one | more for one, more in zip(flat, rest, strict=True)]
-    names = [name for name in {key: None for one in flat for key in one} if name not in ("name", "description")]
+    names = [
+        name for name in {key: None for one in flat for key in one} if name not in ("name", "description")
+    ]
     rows = [[name, *(str(one.get(name, "—")) for one in flat)] for name in names]
     return [row for row in rows if len(set(row[1:])) > 1]
 
@@ -106,7 +116,11 @@ def write(found: Sequence[One], out: str | Path) -> None:
         write_csv(folder / "map.csv", [one.row() for each in found for one in each.maps])
         write_csv(
             folder / "thresholds.csv",
-            [{"corpus": each.label, "level_mm": each.level_mm, **asdict(one)} for each in found for one in each.ks],
+            [
+                {"corpus": each.label, "level_mm": each.level_mm, **asdict(one)}
+                for each in found
+                for one in each.ks
+            ],
         )
         write_json(folder / "map.json", as_json(found))
         page(found).write(folder / "report.html")
@@ -120,14 +134,21 @@ def as_json(found: Sequence[One]) -> dict[str, Any]:
                 "label": one.label,
                 "name": one.corpus.name,
                 "samples": len(one.corpus),
-                "k": {"counts": one.corpus.design.signal.counts, "um": one.corpus.design.signal.displacement_um},
+                "k": {
+                    "counts": one.corpus.design.signal.counts,
+                    "um": one.corpus.design.signal.displacement_um,
+                },
                 "level_mm": one.level_mm,
                 "kind": one.kind,
                 "verdict": one.lines,
                 "maps": [mapped.row() for mapped in one.maps],
                 "thresholds": [asdict(k) for k in one.ks],
                 "noise_dn": one.swept.noise_dn,
-                "area_r2": {"picture_k_dn": one.swept.picture_k, "surface_k_um": one.swept.surface_k, "r2": one.area},
+                "area_r2": {
+                    "picture_k_dn": one.swept.picture_k,
+                    "surface_k_um": one.swept.surface_k,
+                    "r2": one.area,
+                },
                 "surface_error": one.swept.surface_error,
             }
             for one in found
@@ -139,12 +160,16 @@ def as_json(found: Sequence[One]) -> dict[str, Any]:
 def page(found: Sequence[One]) -> Page:
     """Return the report."""
     title = "From surface to picture: " + ", ".join(one.label for one in found)
-    made = Page(title, "Three scalars of the contact surface against the same three of the picture, by a line each.")
+    made = Page(
+        title, "Three scalars of the contact surface against the same three of the picture, by a line each."
+    )
     for one in found:
         made.verdict(*([f"{one.label}:"] if len(found) > 1 else []), *one.lines)
     if len(found) > 1:
         made.section("Side by side").table(*_side_by_side(found))
-        made.figure(figures.compared(found), "The lines of all corpora over the samples that they were fitted to.")
+        made.figure(
+            figures.compared(found), "The lines of all corpora over the samples that they were fitted to."
+        )
         rows = differences([one.corpus for one in found])
         if rows:
             head = ["field", *(one.label for one in found)]
@@ -159,16 +184,23 @@ def page(found: Sequence[One]) -> Page:
 
 
 _NOTES = (
-    "max is the surface's largest tared displacement and the mean of 3 x 3 pixels at the centroid of what exceeds k; "
-    "total the integral over the surface and the sum over the picture; area where k is exceeded. Tared: minus the "
-    "same press without inclusion. Samples without inclusion are left out; samples without a pixel above k have "
+    "max is the surface's largest tared displacement and the mean of 3 x 3 pixels at the centroid of what "
+    "exceeds k; "
+    "total the integral over the surface and the sum over the picture; area where k is exceeded. Tared: "
+    "minus the "
+    "same press without inclusion. Samples without inclusion are left out; samples without a pixel above k "
+    "have "
     "no maximum and no area, and are left out of those two lines.",
-    "A line counts as adequate where its leave-one-out error is at most 5 % of the span of the picture's scalar and "
-    "its bend is insignificant (p >= 0.05) or below 1 % of the span. The range is the widest run of neighbouring "
+    "A line counts as adequate where its leave-one-out error is at most 5 % of the span of the picture's "
+    "scalar and "
+    "its bend is insignificant (p >= 0.05) or below 1 % of the span. The range is the widest run of "
+    "neighbouring "
     "samples in which that is so; it is the best of many tried.",
-    "Intervals are 95 %, for independent normal residuals of one variance. Residuals here follow depth, so the "
+    "Intervals are 95 %, for independent normal residuals of one variance. Residuals here follow depth, so "
+    "the "
     "intervals describe this corpus, not another distribution of inclusions.",
-    "Normalised: both scalars divided by the largest of the corpus, as the paper's Fig. 5 normalises its groups.",
+    "Normalised: both scalars divided by the largest of the corpus, as the paper's Fig. 5 normalises its "
+    "groups.",
     "Everything is simulated; how a real sensor maps can only be told by measuring one.",
 )
 
@@ -177,7 +209,8 @@ def _corpus(made: Page, one: One, prefix: str) -> None:
     made.section(f"{prefix}three lines at {one.level_mm:g} mm, {one.kind}")
     made.figure(
         figures.scatter(one),
-        "Each dot is an inclusion, its colour the depth of its top. Line with 95 % prediction band; dashed: parabola; "
+        "Each dot is an inclusion, its colour the depth of its top. Line with 95 % prediction band; "
+        "dashed: parabola; "
         "grey: the range in which the line holds.",
     )
     made.figure(
@@ -190,30 +223,53 @@ def _corpus(made: Page, one: One, prefix: str) -> None:
     made.section(f"{prefix}press level, tared or raw")
     made.figure(
         figures.levels(one.maps),
-        "Solid: tared; dashed: raw. Slopes are relative to the tared ones of the shallowest press. Raw area is "
+        "Solid: tared; dashed: raw. Slopes are relative to the tared ones of the shallowest press. Raw "
+        "area is "
         "constant where all of the probe is in contact, and has no line.",
     )
     made.section(f"{prefix}threshold k")
     made.figure(
         figures.thresholds(one),
-        f"Maximum and area taken again from the stored pictures at other thresholds, {one.level_mm:g} mm. Noise of a "
-        f"pixel of the tared picture: {one.swept.noise_dn:.2f} counts; left of the dotted line (5 times that) noise "
+        f"Maximum and area taken again from the stored pictures at other thresholds, {one.level_mm:g} mm. "
+        f"Noise of a "
+        f"pixel of the tared picture: {one.swept.noise_dn:.2f} counts; left of the dotted line (5 times "
+        f"that) noise "
         "makes pixels of its own.",
     )
     head = ["k of the picture, counts", *(f"k of the surface {k:g} µm" for k in one.swept.surface_k)]
-    rows = [[f"{k:g}", *(digits(v) for v in line)] for k, line in zip(one.swept.picture_k, one.area, strict=True)]
+    rows = [
+        [f"{k:g}", *(digits(v) for v in line)] for k, line in zip(one.swept.picture_k, one.area, strict=True)
+    ]
     off = one.swept.surface_error
     made.table(
         head,
         rows,
         "R² of the area's line for pairs of thresholds. The surface's area is counted again from the stored "
         "displacement, within the field of view and in half floats"
-        + (f"; at the design's k it departs from the record by {100 * off:.1f} % (median)." if np.isfinite(off) else "."),
+        + (
+            f"; at the design's k it departs from the record by {100 * off:.1f} % (median)."
+            if np.isfinite(off)
+            else "."
+        ),
     )
 
 
 def _fits(maps: Sequence[Mapped]) -> tuple[list[str], list[list[str]], str]:
-    head = ["press", "kind", "scalar", "n", "unseen", "slope", "95 %", "intercept", "R²", "95 %", "LOO %", "norm. slope", "norm. intercept"]
+    head = [
+        "press",
+        "kind",
+        "scalar",
+        "n",
+        "unseen",
+        "slope",
+        "95 %",
+        "intercept",
+        "R²",
+        "95 %",
+        "LOO %",
+        "norm. slope",
+        "norm. intercept",
+    ]
     rows = []
     for one in maps:
         row = one.row()
@@ -235,14 +291,28 @@ def _fits(maps: Sequence[Mapped]) -> tuple[list[str], list[list[str]], str]:
             ]
         )
     caption = (
-        "The lines, picture = intercept + slope x surface. Units: max counts and µm, total 10⁶ counts and mm³, area 10³ "
+        "The lines, picture = intercept + slope x surface. Units: max counts and µm, total 10⁶ counts and "
+        "mm³, area 10³ "
         "pixels and mm². LOO: leave-one-out error (rms), % of the span of the picture's scalar."
     )
     return head, rows, caption
 
 
 def _adequacy(maps: Sequence[Mapped]) -> tuple[list[str], list[list[str]], str]:
-    head = ["press", "kind", "scalar", "line %", "parabola %", "monotone %", "bow %", "p of the bend", "adequate", "holds from", "to", "samples"]
+    head = [
+        "press",
+        "kind",
+        "scalar",
+        "line %",
+        "parabola %",
+        "monotone %",
+        "bow %",
+        "p of the bend",
+        "adequate",
+        "holds from",
+        "to",
+        "samples",
+    ]
     rows = []
     for one in maps:
         if one.fit is None:
@@ -262,7 +332,11 @@ def _adequacy(maps: Sequence[Mapped]) -> tuple[list[str], list[list[str]], str]:
                 str(row["range_samples"]),
             ]
         )
-    return head, rows, "Is a line adequate? Leave-one-out errors of three fits, % of the span; range in the surface's unit."
+    return (
+        head,
+        rows,
+        "Is a line adequate? Leave-one-out errors of three fits, % of the span; range in the surface's unit.",
+    )
 
 
 def _side_by_side(found: Sequence[One]) -> tuple[list[str], list[list[str]], str]:

@@ -13,7 +13,19 @@ if TYPE_CHECKING:
 
 def told(found: Sequence[One]) -> str:
     """Return the lines of the level that is shown, and three lines of verdict, for each corpus."""
-    head = ["corpus", "press", "scalar", "n", "unseen", "slope", "R²", "LOO %", "parabola %", "monotone %", "line"]
+    head = [
+        "corpus",
+        "press",
+        "scalar",
+        "n",
+        "unseen",
+        "slope",
+        "R²",
+        "LOO %",
+        "parabola %",
+        "monotone %",
+        "line",
+    ]
     rows = []
     for each in found:
         for one in each.shown():
@@ -25,14 +37,22 @@ def told(found: Sequence[One]) -> str:
                     f"{one.pair.name}, {one.kind}",
                     str(len(one.x)),
                     str(one.unseen),
-                    "—" if one.fit is None else f"{digits(row['slope'])} {one.pair.picture_unit}/{one.pair.surface_unit}",
+                    "—"
+                    if one.fit is None
+                    else f"{digits(row['slope'])} {one.pair.picture_unit}/{one.pair.surface_unit}",
                     digits(row["r2"]),
-                    *(digits(row[f"left_out_{name}_percent"], 2) for name in ("linear", "quadratic", "monotone")),
+                    *(
+                        digits(row[f"left_out_{name}_percent"], 2)
+                        for name in ("linear", "quadratic", "monotone")
+                    ),
                     {True: "adequate", False: "not adequate", None: "none"}[row["adequate"]],
                 ]
             )
     widths = [max(len(line[i]) for line in [head, *rows]) for i in range(len(head))]
-    lines = ["  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in [head, *rows]]
+    lines = [
+        "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()
+        for line in [head, *rows]
+    ]
     for each in found:
         lines += ["", *([f"{each.label}:"] if len(found) > 1 else []), *each.lines]
     return "\n".join(lines)

@@ -54,7 +54,9 @@ def at_thresholds(swept: Swept, surface_max: Floats, surface_area: Floats, pixel
     found = []
     for i, k in enumerate(swept.picture_k):
         seen = swept.area_px[:, i] > 0
-        lines = [_fit(x[seen], y[seen, i]) for x, y in ((surface_max, swept.max_dn), (surface_area, swept.area_px))]
+        lines = [
+            _fit(x[seen], y[seen, i]) for x, y in ((surface_max, swept.max_dn), (surface_area, swept.area_px))
+        ]
         found.append(
             AtThreshold(
                 k_dn=float(k),
@@ -70,7 +72,7 @@ def at_thresholds(swept: Swept, surface_max: Floats, surface_area: Floats, pixel
 
 
 def area_r2(swept: Swept) -> Floats:
-    """R² (p, s) of the area's line for every k of the picture and every k of the surface; NaN where none fits."""
+    """R² (p, s) of the area's line for each k of the picture and each of the surface; NaN where none fits."""
     found = np.full((len(swept.picture_k), len(swept.surface_k)), np.nan)
     for i in range(len(swept.picture_k)):
         seen = swept.area_px[:, i] > 0
@@ -80,7 +82,7 @@ def area_r2(swept: Swept) -> Floats:
 
 
 def headline(maps: Sequence[Mapped], kind: str) -> float:
-    """Return the press level whose lines do best: least mean leave-one-out error, unseen samples counted whole."""
+    """Return the press level whose lines do best by their leave-one-out errors; an unseen sample is 100 % off."""
     levels = sorted({one.level_mm for one in maps})
 
     def cost(level: float) -> float:
@@ -94,7 +96,14 @@ def headline(maps: Sequence[Mapped], kind: str) -> float:
     return min(levels, key=cost)
 
 
-def verdict(maps: Sequence[Mapped], kind: str, level_mm: float, ks: Sequence[AtThreshold], noise_dn: float, k_dn: float) -> list[str]:
+def verdict(
+    maps: Sequence[Mapped],
+    kind: str,
+    level_mm: float,
+    ks: Sequence[AtThreshold],
+    noise_dn: float,
+    k_dn: float,
+) -> list[str]:
     """Return the three lines, of one corpus."""
     here = {one.pair.name: one for one in maps if (one.kind, one.level_mm) == (kind, level_mm)}
     what = [_what(here[pair.name]) for pair in PAIRS if pair.name in here]
@@ -102,7 +111,9 @@ def verdict(maps: Sequence[Mapped], kind: str, level_mm: float, ks: Sequence[AtT
     unseen = here["max"].unseen if "max" in here else 0
     total = unseen + len(here["max"].x) if "max" in here else 0
     if unseen:
-        where.append(f"{unseen} of {total} inclusions have no pixel above k = {k_dn:g} counts: no maximum, no area")
+        where.append(
+            f"{unseen} of {total} inclusions have no pixel above k = {k_dn:g} counts: no maximum, no area"
+        )
     return [
         f"What the map is ({kind}, {level_mm:g} mm): " + "; ".join(what) + ".",
         "Where a line holds: " + "; ".join(where) + ".",
@@ -146,7 +157,8 @@ def _changes(
         low = allowed[0]
         if now.unseen_percent - low.unseen_percent >= 5 or low.r2_area > now.r2_area + 0.05:
             found.append(
-                f"lower signal.counts from {k_dn:g} to {low.k_dn:g} ({low.k_dn / noise_dn:.1f} times the noise of "
+                f"lower signal.counts from {k_dn:g} to {low.k_dn:g} ({low.k_dn / noise_dn:.1f} times the "
+                f"noise of "
                 f"{noise_dn:.2f} counts): unseen {now.unseen_percent:.0f} -> {low.unseen_percent:.0f} %, "
                 f"R² of the area {now.r2_area:.2f} -> {low.r2_area:.2f}"
             )
@@ -157,7 +169,9 @@ def _changes(
         f"{one.pair.name} ({one.fit.best}, error {100 * one.fit.error:.1f} -> "
         f"{100 * one.fit.error * one.fit.left_out[one.fit.best] / one.fit.left_out['linear']:.1f} %)"
         for one in here.values()
-        if one.fit is not None and not one.fit.adequate and one.fit.left_out[one.fit.best] < 0.9 * one.fit.left_out["linear"]
+        if one.fit is not None
+        and not one.fit.adequate
+        and one.fit.left_out[one.fit.best] < 0.9 * one.fit.left_out["linear"]
     ]
     if bent:
         found.append("use a bent map for " + ", ".join(bent))
@@ -170,7 +184,8 @@ def _changes(
     scattered = [
         one.pair.name
         for one in here.values()
-        if one.fit is not None and min(one.fit.left_out.values()) > Limits().tolerance * one.fit.line.left_out_rmse / one.fit.error
+        if one.fit is not None
+        and min(one.fit.left_out.values()) > Limits().tolerance * one.fit.line.left_out_rmse / one.fit.error
     ]
     if scattered:
         found.append(

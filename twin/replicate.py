@@ -40,7 +40,7 @@ def replicate(
     corpus : a finished corpus; without one the study ``paper`` (or ``paper-quick``) is planned and run in
         OUT/corpus, or gone on with if it is there.
     seed : of the corpus, where it is planned here, and of the networks.
-    emulator : file to simulate the corpus by; default emulators/tsis.npz if it is there, and not with `quick`.
+    emulator : file to simulate the corpus by; default emulators/tsis.npz if it is there, but with `quick`.
     repeats : networks per estimate, default 100, or 20 with `quick`.
 
     Raises
@@ -85,16 +85,25 @@ def simulate(
         plan = load_plan(folder)
         if (plan.name, plan.head.seed) != (study, seed):
             received = f"the corpus {shown(plan.name)} of seed {plan.head.seed}"
-            raise DesignError("out", received, f"{study} of seed {seed}, or another folder", source=str(folder))
+            raise DesignError(
+                "out", received, f"{study} of seed {seed}, or another folder", source=str(folder)
+            )
         if emulator is not None and plan.mechanics != "emulator":
-            raise DesignError("--emulator", "a corpus planned without it", "another folder", source=str(folder))
+            raise DesignError(
+                "--emulator", "a corpus planned without it", "another folder", source=str(folder)
+            )
     else:
-        plan = freeze(study, folder, seed=seed, mechanics="emulator" if file else None, emulator=file, progress=tell)
+        plan = freeze(
+            study, folder, seed=seed, mechanics="emulator" if file else None, emulator=file, progress=tell
+        )
     tell("corpus", 0.0)
     state = run(folder, workers, progress=lambda now: tell("corpus", now.done / max(now.planned, 1)))
     if state.failed:
         raise DesignError(
-            "corpus", f"{state.failed} samples that failed", "none (twin corpus status says why)", source=str(folder)
+            "corpus",
+            f"{state.failed} samples that failed",
+            "none (twin corpus status says why)",
+            source=str(folder),
         )
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,17 +35,35 @@ GOAL = {"size_mm": 0.6, "depth_mm": 0.8}
 
 VARIANTS = (
     inversion.PLAIN,
-    Variant("paper-phantoms", "the same, lines through the nine phantoms as the paper did", source="phantoms"),
+    Variant("paper-phantoms", "the paper's chain, lines through the nine phantoms", source="phantoms"),
     Variant("paper-logs", "a line per scalar, network on logarithms", logs=True),
     Variant("paper-split", "a line per scalar, E with a network of its own", split=True),
-    Variant("joint", "each surface scalar linear in all three of the picture, network on surface scalars", "joint"),
-    Variant("joint-split", "the same, E with a network of its own", "joint", split=True),
-    Variant("joint-logs-split", "the same between logarithms", "joint", logs=True, split=True),
+    Variant("joint", "each surface scalar linear in all three of the picture", "joint"),
+    Variant("joint-split", "the same joint linear map, E with a network of its own", "joint", split=True),
+    Variant(
+        "joint-logs-split",
+        "joint map and network between logarithms, E with a network of its own",
+        "joint",
+        logs=True,
+        split=True,
+    ),
     Variant("picture", "no mapping: network trained on the picture's scalars", "network"),
-    Variant("picture-split", "the same, E with a network of its own", "network", split=True),
-    Variant("picture-logs-split", "the same on logarithms", "network", logs=True, split=True),
-    Variant("surface", "no picture: the network is asked with the surface's true scalars", "none"),
-    Variant("surface-logs-split", "the same on logarithms, E with a network of its own", "none", logs=True, split=True),
+    Variant("picture-split", "no mapping, E with a network of its own", "network", split=True),
+    Variant(
+        "picture-logs-split",
+        "no mapping, logarithms, E with a network of its own",
+        "network",
+        logs=True,
+        split=True,
+    ),
+    Variant("surface", "no picture: the network gets the surface's true scalars", "none"),
+    Variant(
+        "surface-logs-split",
+        "no picture, logarithms, E with a network of its own",
+        "none",
+        logs=True,
+        split=True,
+    ),
 )
 
 CANDIDATES = tuple(one.name for one in VARIANTS if one.mapping != "none" and one.source == "box")
@@ -207,12 +226,13 @@ def cross(data: Scalars, variant: Variant, k_dn: float, seed: int) -> Crossed:
 
 
 def _run_all(found: Replication, ks: Sequence[float], tell: Callable[[str, float], None]) -> None:
-    """All chains at the main level by 125/9; the plain and the chosen one by both protocols at every level."""
+    """All chains at the main level; the plain and the chosen one at every level, and by both protocols."""
     depths = sorted({mm for mm, _ in found.levels})
     name, k_best = found.chosen
     todo: list[tuple[Variant, bool, tuple[float, ...], float]] = []
     for k in ks:
-        todo += [(variant, False, (found.main_mm,), k) for variant in VARIANTS]
+        asked = [one for one in VARIANTS if one.mapping != "none" or k == ks[0]]  # which knows no k
+        todo += [(variant, False, (found.main_mm,), k) for variant in asked]
         todo += [(_variant(one), True, (found.main_mm,), k) for one in ("paper", "paper-phantoms")]
     todo.append((_variant(name), True, (found.main_mm,), k_best))
     for mm in depths:
@@ -222,14 +242,14 @@ def _run_all(found: Replication, ks: Sequence[float], tell: Callable[[str, float
         todo += [(_variant(name), False, tuple(depths), k_best)]
     todo = list(dict.fromkeys(todo))
     networks: dict[tuple[object, ...], Any] = {}
-    for place, (variant, left_out, mm, k) in enumerate(todo):
-        data = inversion.beside([found.levels[one, k] for one in mm])
+    for place, (variant, left_out, some, k) in enumerate(todo):
+        data = inversion.beside([found.levels[one, k] for one in some])
         cache = networks if variant.mapping != "network" else None  # its networks know k
         every = inversion.estimate(
             data, variant, left_out=left_out, repeats=found.repeats, seed=found.seed, cache=cache
         )
         protocol = "leave-one-out" if left_out else "125/9"
-        found.runs.append(Run(variant, protocol, mm, k, every.mean(axis=0), every.std(axis=0)))
+        found.runs.append(Run(variant, protocol, some, k, every.mean(axis=0), every.std(axis=0)))
         tell("networks", (place + 1) / len(todo))
 
 
@@ -251,18 +271,24 @@ def _lowered(
             picture_k=[low],
             surface=False,
             samples=data.sample,
-            progress=lambda done, total, step=step: tell("pictures", (step + done / total) / len(first)),
+            progress=partial(_tell_part, tell, step, len(first)),
         )
         picture = np.column_stack([swept.max_dn[:, 0], data.picture[:, 1], swept.area_px[:, 0]])
         found.append(replace(data, picture=picture))
     return probe.noise_dn, low, found
 
 
+def _tell_part(tell: Callable[[str, float], None], part: int, parts: int, done: int, total: int) -> None:
+    tell("pictures", (part + done / total) / parts)
+
+
 def _variant(name: str) -> Variant:
     return next(one for one in VARIANTS if one.name == name)
 
 
-def figures_of(truth: Floats, estimate: Floats, places: Sequence[int] | None = None) -> dict[str, list[float]]:
+def figures_of(
+    truth: Floats, estimate: Floats, places: Sequence[int] | None = None
+) -> dict[str, list[float]]:
     """Return MAE, RMSE and bias, three numbers each, over all nine phantoms or some."""
     some = np.arange(len(truth)) if places is None else np.asarray(places)
     found = paper.errors(truth[some], estimate[some])
@@ -365,6 +391,8 @@ def worth_of_modulus(found: Replication) -> str:
     else:
         verdict = "it is an estimate"
     return (
-        f"E from three scalars, best of all chains on random inclusions: 90 % lie within ±{half:.0f} kPa of the estimate, "
-        f"within ±{prior:.0f} kPa of a constant; it explains {100 * max(share, 0.0):.0f} % of the variance: {verdict}."
+        f"E from three scalars, best of all chains on random inclusions: 90 % lie within ±{half:.0f} kPa "
+        f"of the estimate, "
+        f"within ±{prior:.0f} kPa of a constant; it explains {100 * max(share, 0.0):.0f} % of the "
+        f"variance: {verdict}."
     )

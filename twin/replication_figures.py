@@ -37,12 +37,20 @@ def relief(corpus: Corpus, level: int, samples: NDArray[np.int64]) -> Figure:
         axes: Any = figure.add_subplot(1, 2, place + 1, projection="3d")
         picture = grey(corpus.tared(int(samples[number]), [level])[0])
         rows, columns = (side // _BLOCK for side in picture.shape)
-        means = picture[: rows * _BLOCK, : columns * _BLOCK].reshape(rows, _BLOCK, columns, _BLOCK).mean(axis=(1, 3))
+        means = (
+            picture[: rows * _BLOCK, : columns * _BLOCK]
+            .reshape(rows, _BLOCK, columns, _BLOCK)
+            .mean(axis=(1, 3))
+        )
         x = ((np.arange(columns) + 0.5) / columns - 0.5) * camera.field_of_view_mm
         y = (0.5 - (np.arange(rows) + 0.5) / rows) * camera.field_height_mm
-        axes.plot_surface(*np.meshgrid(x, y), means, cmap="jet", rstride=1, cstride=1, lw=0, antialiased=False)
+        axes.plot_surface(
+            *np.meshgrid(x, y), means, cmap="jet", rstride=1, cstride=1, lw=0, antialiased=False
+        )
         size, depth, modulus = paper.true_inclusions()[number]
-        axes.set_title(f"phantom {number + 1}: d {size:g} mm, h {depth:g} mm, {modulus:g} kPa", fontsize=10, color=INK)
+        axes.set_title(
+            f"phantom {number + 1}: d {size:g} mm, h {depth:g} mm, {modulus:g} kPa", fontsize=10, color=INK
+        )
         axes.set_xlabel("x, mm", fontsize=9)
         axes.set_ylabel("y, mm", fontsize=9)
         axes.set_zlabel("counts over the reference", fontsize=9)
@@ -52,14 +60,19 @@ def relief(corpus: Corpus, level: int, samples: NDArray[np.int64]) -> Figure:
 
 
 def model(corpus: Corpus, level: int) -> Figure:
-    """Draw Fig. 4: mesh and vertical displacement of the press on phantom 9, cut at y = 0 (coarse, small strain)."""
+    """Draw Fig. 4: mesh and vertical displacement under a press on phantom 9, y = 0 (coarse, small strain)."""
     design, depth = corpus.design, corpus.indentation_mm[level]
     size, deep, modulus = paper.true_inclusions()[8]
     inclusion = fem.Inclusion(size=float(size), depth=float(deep), modulus=float(modulus))
-    pressed = fem.press(design.probe(), design.slab(), inclusion, depth, quality="preview", mechanics="linear")
+    pressed = fem.press(
+        design.probe(), design.slab(), inclusion, depth, quality="preview", mechanics="linear"
+    )
     cut = pressed.cut
     moved = np.asarray(cut.points) + np.asarray(cut.point_data["displacement"])
-    tared = 1e3 * (np.asarray(cut.point_data["displacement"]) - np.asarray(cut.point_data["displacement_0"]))[:, 2]
+    tared = (
+        1e3
+        * (np.asarray(cut.point_data["displacement"]) - np.asarray(cut.point_data["displacement_0"]))[:, 2]
+    )
     corners = quads(cut)
     material = np.asarray(cut.cell_data["material"])
     figure, axes = panels(1, 2, 4.0)
@@ -111,17 +124,28 @@ def regressions(data: Scalars, low: Scalars, k: float, low_k: float) -> Figure:
     for row, (some, threshold) in enumerate([(data, k), (low, low_k)][:rows]):
         for column, (x, y, line) in enumerate(phantom_lines(some)):
             axis = axes[3 * row + column]
-            for group, colour, words in zip(GROUPS, (BLUE, GREEN, RED), ("size", "depth", "modulus"), strict=True):
+            for group, colour, words in zip(
+                GROUPS, (BLUE, GREEN, RED), ("size", "depth", "modulus"), strict=True
+            ):
                 axis.plot(x[list(group)], y[list(group)], "o", color=colour, ms=6, label=f"{words} varies")
             ends = np.array([0.0, 1.0])
             axis.plot(ends, line(ends), color=INK, lw=1.3)
             low_end, high_end = line.fit.confidence(np.linspace(0, 1, 50))
             axis.fill_between(np.linspace(0, 1, 50), low_end, high_end, color=GREY, alpha=0.2, lw=0)
             name = ("maximum", "total", "area")[column]
-            axis.set_title(f"({'abcdef'[3 * row + column]}) {name}, k = {threshold:g} counts", loc="left", fontsize=10)
+            axis.set_title(
+                f"({'abcdef'[3 * row + column]}) {name}, k = {threshold:g} counts", loc="left", fontsize=10
+            )
             axis.set_xlabel("surface, normalised")
             axis.set_ylabel("picture, normalised" if column == 0 else "")
-            axis.text(0.03, 0.97, f"R² = {line.r2:.3f}\nslope {line.slope:.2f}", transform=axis.transAxes, va="top", fontsize=8.5)
+            axis.text(
+                0.03,
+                0.97,
+                f"R² = {line.r2:.3f}\nslope {line.slope:.2f}",
+                transform=axis.transAxes,
+                va="top",
+                fontsize=8.5,
+            )
             axis.set_ylim(-0.25, 1.25)
     axes[0].legend(frameon=False, fontsize=8, loc="lower right")
     return figure
@@ -168,5 +192,3 @@ def crossed(found: Replication) -> Figure:
         told = f"explains {100 * share:.0f} %" if share > 0 else "worse than a constant"
         axis.text(0.03, 0.97, told, transform=axis.transAxes, va="top", fontsize=8.5)
     return figure
-
-

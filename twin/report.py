@@ -1,4 +1,4 @@
-"""A page of results in one file: text, tables and figures as HTML that needs no network, CSV and JSON beside it.
+"""A page of results in one file, HTML that needs no network: text, tables, figures; CSV and JSON beside it.
 
     page = Page("Mapping", "what the corpus says")
     page.section("Lines").text("...").table(["k", "R²"], [["2", "0.99"]]).figure(figure, "caption")
@@ -46,7 +46,8 @@ figure img { width: 100%; height: auto; display: block; }
 figcaption, caption { color: #555; font-size: .88rem; text-align: left; max-width: 95ch; }
 caption { padding: .4rem 0; caption-side: top; }
 .wide { overflow-x: auto; }
-table { border-collapse: collapse; font-size: .88rem; margin: .8rem 0 1.2rem; font-variant-numeric: tabular-nums; }
+table { border-collapse: collapse; font-size: .88rem; margin: .8rem 0 1.2rem;
+        font-variant-numeric: tabular-nums; }
 th, td { padding: .22rem .6rem; text-align: right; border-bottom: 1px solid #e5e5e5; white-space: nowrap; }
 th { border-bottom: 2px solid #999; vertical-align: bottom; font-weight: 600; }
 th:first-child, td:first-child { text-align: left; padding-left: 0; }
@@ -86,7 +87,11 @@ class Page:
         return self._put("<ul>" + "".join(f"<li>{html.escape(item)}</li>" for item in items) + "</ul>")
 
     def table(
-        self, head: Sequence[str], rows: Sequence[Sequence[Any]], caption: str = "", strong: Sequence[int] = ()
+        self,
+        head: Sequence[str],
+        rows: Sequence[Sequence[Any]],
+        caption: str = "",
+        strong: Sequence[int] = (),
     ) -> Page:
         """Add a table of cells that are shown as they are; rows in `strong` stand out.
 
@@ -100,7 +105,8 @@ class Page:
         said = f"<caption>{html.escape(caption)}</caption>" if caption else ""
         body = "\n".join(lines)
         return self._put(
-            f'<div class="wide"><table>{said}<thead><tr>{top}</tr></thead>\n<tbody>{body}</tbody></table></div>'
+            f'<div class="wide"><table>{said}<thead><tr>{top}</tr></thead>\n'
+            f"<tbody>{body}</tbody></table></div>"
         )
 
     def figure(self, figure: Figure, caption: str, *, pixels: bool = False) -> Page:
@@ -199,7 +205,7 @@ def plainly(content: Any) -> Any:
 
 
 def digits(value: float | None, count: int = 3) -> str:
-    """Return a number with so many digits, without an exponent between 1e-4 and 1e7; — for what is not known."""
+    """Return a number with so many digits, no exponent between 1e-4 and 1e7; — for what is not known."""
     if value is None or not math.isfinite(value):
         return "—"
     if value == 0:

@@ -78,5 +78,3 @@ def _replicate(arguments: argparse.Namespace) -> int:
     print(found)
     print(f"look at: {Path(arguments.out) / 'report.html'}")
     return 0
-
-

@@ -1,7 +1,7 @@
 """The scalars of a corpus at other thresholds k, from its stored pictures and displacements.
 
-A record holds what the design's k gives. The picture's own scalars are taken again from the stored counts, and
-are then exact. The surface's area is counted from `displacement.z`, which covers the camera's field of view
+A record holds what the design's k gives. The picture's own scalars are taken again from the stored counts,
+and are exact. The surface's area is counted from `displacement.z`, which covers the camera's field of view
 only, in half floats: it misses what lies outside the picture, and grains of up to 0.5 µm (at presses below
 1 mm in depth of the surface) blur its edge. How far it is from the record at the design's k is told beside.
 """
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from estimation import scalars
 from scenes import exr
@@ -30,7 +30,7 @@ SURFACE_STEPS = (0.5, 1.0, 2.0, 4.0)
 """Thresholds that are tried, as shares of the design's."""
 
 SIGMAS = 5.0
-"""A threshold so many standard deviations of a pixel's noise up: one of 3.5 million pixels passes by noise."""
+"""A threshold so many standard deviations of a pixel's noise up: one in 3.5 million passes by noise."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Swept:
     max_dn, area_px : (n, p) of the tared picture.
     area_mm2 : (n, s) of the tared displacement, within the field of view.
     noise_dn : standard deviation of a pixel of the tared picture, counts, median over samples.
-    surface_error : median over samples of |area_mm2 at the design's k / that of the record - 1|, of those that
+    surface_error : median over samples of |area_mm2 at the design's k / the record's - 1|, of those that
         keep clear of the picture's edge; NaN where none does.
     """
 
@@ -67,7 +67,7 @@ def sweep(
     most: int = 150,
     picture_k: Sequence[float] | None = None,
     surface: bool = True,
-    samples: Sequence[int] | None = None,
+    samples: ArrayLike | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Swept:
     """Take the scalars of at most so many samples, evenly spread, at other thresholds.
@@ -131,7 +131,7 @@ def _area_mm2(corpus: Corpus, pushed: NDArray[Any], k_mm: float) -> float:
 
 
 def _noise(tared: Floats) -> float:
-    """Standard deviation of a pixel, from the differences of neighbours: light changes little between them."""
+    """Standard deviation of a pixel, from differences of neighbours, between which light changes little."""
     apart = np.diff(tared, axis=1)
     return float(1.4826 * np.median(np.abs(apart - np.median(apart))) / np.sqrt(2.0)) or float(
         apart.std() / np.sqrt(2.0)
