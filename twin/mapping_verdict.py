@@ -82,7 +82,7 @@ def area_r2(swept: Swept) -> Floats:
 
 
 def headline(maps: Sequence[Mapped], kind: str) -> float:
-    """Return the press level whose lines do best by their leave-one-out errors; an unseen sample is 100 % off."""
+    """Return the press level whose leave-one-out errors are least; an unseen sample is 100 % off."""
     levels = sorted({one.level_mm for one in maps})
 
     def cost(level: float) -> float:

@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from estimation import paper
 from twin import inversion, thresholds
 from twin.earlier import Earlier, earlier
 from twin.inversion import Scalars, Variant
 
 if TYPE_CHECKING:
+    from estimation.ann import Settings
     from twin.corpus import Corpus
 
 Floats = NDArray[np.float64]
@@ -29,6 +29,9 @@ MAIN_MM = 2.0
 
 LARGE = np.array([1, 2, 3, 4, 5, 6, 7, 8])
 """Places in Table I of the phantoms of 7 mm and more."""
+
+FROM_MM = 4.0
+"""Smallest of the random inclusions that chains are judged by: smaller ones hardly show."""
 
 GOAL = {"size_mm": 0.6, "depth_mm": 0.8}
 """Root mean squared errors, mm, that three scalars should reach on the large phantoms."""
@@ -99,8 +102,8 @@ class Crossed:
     Attributes
     ----------
     estimate, truth : (n, 3).
-    rmse : (3,) over those of 4 mm and more.
-    half_width : (3,) of an interval around the estimate that holds 90 % of these truths.
+    rmse : (3,) over those of `FROM_MM` and more, as all below.
+    half_width : (3,) of an interval around the estimate that holds 90 % of the truths.
     explained : (3,) share of the variance that the estimates explain, below 0 where worse than the mean.
     """
 
@@ -160,6 +163,7 @@ def replicate(
     *,
     repeats: int = 100,
     seed: int = 0,
+    settings: Settings | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> Replication:
     """Run the paper's chain, its variants and its predecessors on a corpus with the nine phantoms.
@@ -190,11 +194,11 @@ def replicate(
     ks = list(dict.fromkeys((k, low)))
     for number, one in enumerate(ks):
         for place, name in enumerate(CANDIDATES):
-            found.crossed.append(cross(levels[depths[main], one], _variant(name), one, seed))
+            found.crossed.append(cross(levels[depths[main], one], _variant(name), one, seed, settings))
             tell("cross-validation", (number * len(CANDIDATES) + place + 1) / (len(ks) * len(CANDIDATES)))
     best = min(found.crossed, key=lambda one: float(((one.rmse / one.truth.std(axis=0))[:2] ** 2).sum()))
     found = replace(found, chosen=(best.variant.name, best.k_dn))
-    _run_all(found, ks, tell)
+    _run_all(found, ks, settings, tell)
     guesses = earlier(
         corpus,
         main,
@@ -202,17 +206,20 @@ def replicate(
         levels[depths[main], low].picture[first[main].phantoms],
         repeats=repeats,
         seed=seed,
+        settings=settings,
         progress=lambda done: tell("earlier methods", done),
     )
     return replace(found, earlier=guesses)
 
 
-def cross(data: Scalars, variant: Variant, k_dn: float, seed: int) -> Crossed:
+def cross(
+    data: Scalars, variant: Variant, k_dn: float, seed: int, settings: Settings | None = None
+) -> Crossed:
     """Cross-validate a chain on the random inclusions."""
     truth = data.truth[data.box]
-    guess = inversion.crossed(data, variant, seed=seed)
+    guess = inversion.crossed(data, variant, seed=seed, settings=settings)
     off = guess - truth
-    large = truth[:, 0] >= 4.0
+    large = truth[:, 0] >= FROM_MM
     return Crossed(
         variant=variant,
         level_mm=data.level_mm,
@@ -220,12 +227,14 @@ def cross(data: Scalars, variant: Variant, k_dn: float, seed: int) -> Crossed:
         estimate=guess,
         truth=truth,
         rmse=np.sqrt((off[large] ** 2).mean(axis=0)),
-        half_width=np.quantile(np.abs(off), 0.9, axis=0, method="higher"),
-        explained=1.0 - (off**2).mean(axis=0) / truth.var(axis=0),
+        half_width=np.quantile(np.abs(off[large]), 0.9, axis=0, method="higher"),
+        explained=1.0 - (off[large] ** 2).mean(axis=0) / truth[large].var(axis=0),
     )
 
 
-def _run_all(found: Replication, ks: Sequence[float], tell: Callable[[str, float], None]) -> None:
+def _run_all(
+    found: Replication, ks: Sequence[float], settings: Settings | None, tell: Callable[[str, float], None]
+) -> None:
     """All chains at the main level; the plain and the chosen one at every level, and by both protocols."""
     depths = sorted({mm for mm, _ in found.levels})
     name, k_best = found.chosen
@@ -246,7 +255,13 @@ def _run_all(found: Replication, ks: Sequence[float], tell: Callable[[str, float
         data = inversion.beside([found.levels[one, k] for one in some])
         cache = networks if variant.mapping != "network" else None  # its networks know k
         every = inversion.estimate(
-            data, variant, left_out=left_out, repeats=found.repeats, seed=found.seed, cache=cache
+            data,
+            variant,
+            left_out=left_out,
+            repeats=found.repeats,
+            seed=found.seed,
+            settings=settings,
+            cache=cache,
         )
         protocol = "leave-one-out" if left_out else "125/9"
         found.runs.append(Run(variant, protocol, some, k, every.mean(axis=0), every.std(axis=0)))
@@ -284,115 +299,3 @@ def _tell_part(tell: Callable[[str, float], None], part: int, parts: int, done: 
 
 def _variant(name: str) -> Variant:
     return next(one for one in VARIANTS if one.name == name)
-
-
-def figures_of(
-    truth: Floats, estimate: Floats, places: Sequence[int] | None = None
-) -> dict[str, list[float]]:
-    """Return MAE, RMSE and bias, three numbers each, over all nine phantoms or some."""
-    some = np.arange(len(truth)) if places is None else np.asarray(places)
-    found = paper.errors(truth[some], estimate[some])
-    return {"mae": found.mae.tolist(), "rmse": found.rmse.tolist(), "bias": found.bias.tolist()}
-
-
-def as_json(found: Replication) -> dict[str, Any]:
-    """Return every number of the replication, under names that stay."""
-    truth, published = paper.true_inclusions(), paper.published_estimates()
-    prior, mean = paper.constant(truth, paper.prior_mean()), paper.constant(truth)
-
-    def both(estimate: Floats) -> dict[str, Any]:
-        return {"all": figures_of(truth, estimate), "large": figures_of(truth, estimate, LARGE.tolist())}
-
-    best = best_modulus(found)
-    return {
-        "parameters": list(paper.PARAMETERS),
-        "paper": {
-            "table1": truth,
-            "table2": published,
-            "table3_printed": paper.published_errors(),
-            "recomputed": both(published),
-        },
-        "constants": {"prior_mean": both(prior), "mean_of_the_nine": both(mean)},
-        "trained": found.trained,
-        "repeats": found.repeats,
-        "seed": found.seed,
-        "main_mm": found.main_mm,
-        "k_dn": found.k_dn,
-        "low_k_dn": found.low_k_dn,
-        "noise_dn": found.noise_dn,
-        "chosen": {"variant": found.chosen[0], "k_dn": found.chosen[1]},
-        "runs": [
-            {
-                "variant": run.variant.name,
-                "words": run.variant.words,
-                "protocol": run.protocol,
-                "level_mm": list(run.level_mm),
-                "k_dn": run.k_dn,
-                "estimate": run.estimate,
-                "spread": run.spread,
-                **both(run.estimate),
-            }
-            for run in found.runs
-        ],
-        "earlier": [
-            {"name": one.name, "words": one.words, "estimate": one.estimate, **both(one.estimate)}
-            for one in found.earlier
-        ],
-        "cross_validated": [
-            {
-                "variant": one.variant.name,
-                "level_mm": list(one.level_mm),
-                "k_dn": one.k_dn,
-                "rmse_from_4_mm": one.rmse,
-                "half_width_90": one.half_width,
-                "explained": one.explained,
-            }
-            for one in found.crossed
-        ],
-        "modulus": {
-            "half_width_90_kPa": best.half_width[2],
-            "explained": best.explained[2],
-            "words": worth_of_modulus(found),
-        },
-        "goal": goal(found),
-    }
-
-
-def goal(found: Replication) -> dict[str, Any]:
-    """Return whether the chosen chain, by 125/9 at the main level, does what three scalars should."""
-    name, k = found.chosen
-    run = found.run(name, "125/9", (found.main_mm,), k)
-    reached = paper.rmse(paper.true_inclusions()[LARGE], run.estimate[LARGE])
-    plain = found.run("paper", "125/9", (found.main_mm,), found.k_dn)
-    first = paper.rmse(paper.true_inclusions()[LARGE], plain.estimate[LARGE])
-    return {
-        "rmse_mm": {key: float(reached[i]) for i, key in enumerate(GOAL)},
-        "plain_rmse_mm": {key: float(first[i]) for i, key in enumerate(GOAL)},
-        "allowed_mm": GOAL,
-        "met": all(reached[i] <= limit for i, limit in enumerate(GOAL.values())),
-        "met_by_the_plain_chain": all(first[i] <= limit for i, limit in enumerate(GOAL.values())),
-    }
-
-
-def best_modulus(found: Replication) -> Crossed:
-    """Return what did best on E of the random inclusions."""
-    return max(found.crossed, key=lambda one: float(one.explained[2]))
-
-
-def worth_of_modulus(found: Replication) -> str:
-    """Say plainly what the estimated modulus is worth, from the random inclusions."""
-    best = best_modulus(found)
-    half, share = float(best.half_width[2]), float(best.explained[2])
-    prior = float(np.quantile(np.abs(best.truth[:, 2] - best.truth[:, 2].mean()), 0.9))
-    if share < 0.1:
-        verdict = "it is worth nothing: the mean of the training set does as well"
-    elif share < 0.5:
-        verdict = "it tells soft from stiff at best"
-    else:
-        verdict = "it is an estimate"
-    return (
-        f"E from three scalars, best of all chains on random inclusions: 90 % lie within ±{half:.0f} kPa "
-        f"of the estimate, "
-        f"within ±{prior:.0f} kPa of a constant; it explains {100 * max(share, 0.0):.0f} % of the "
-        f"variance: {verdict}."
-    )

@@ -15,6 +15,7 @@ from estimation.regression import Line, fit_line
 from twin.frame import grey
 from twin.inversion import Scalars
 from twin.panels import quads
+from twin.replication import FROM_MM
 from twin.report import BLUE, GREEN, GREY, INK, RED, panels
 
 if TYPE_CHECKING:
@@ -60,7 +61,7 @@ def relief(corpus: Corpus, level: int, samples: NDArray[np.int64]) -> Figure:
 
 
 def model(corpus: Corpus, level: int) -> Figure:
-    """Draw Fig. 4: mesh and vertical displacement under a press on phantom 9, y = 0 (coarse, small strain)."""
+    """Draw Fig. 4: mesh and vertical displacement, a press on phantom 9, y = 0 (coarse, small strain)."""
     design, depth = corpus.design, corpus.indentation_mm[level]
     size, deep, modulus = paper.true_inclusions()[8]
     inclusion = fem.Inclusion(size=float(size), depth=float(deep), modulus=float(modulus))
@@ -185,10 +186,14 @@ def crossed(found: Replication) -> Figure:
         half = best.half_width[column]
         axis.fill_between(ends, ends - half, ends + half, color=BLUE, alpha=0.12, lw=0)
         axis.plot(ends, ends, color=INK, lw=1)
-        axis.plot(x, y, "o", color=BLUE, ms=3.5, mew=0, alpha=0.8)
+        small = best.truth[:, 0] < FROM_MM
+        axis.plot(x[~small], y[~small], "o", color=BLUE, ms=3.5, mew=0, alpha=0.8)
+        axis.plot(x[small], y[small], "o", mfc="none", color=GREY, ms=3.5, label=f"below {FROM_MM:g} mm")
         axis.set_xlabel(f"true {words}")
         axis.set_ylabel(f"estimated {words}")
         share = best.explained[column]
         told = f"explains {100 * share:.0f} %" if share > 0 else "worse than a constant"
         axis.text(0.03, 0.97, told, transform=axis.transAxes, va="top", fontsize=8.5)
+        if column == 1:
+            axis.legend(frameon=False, fontsize=8, loc="lower right", handletextpad=0.1)
     return figure

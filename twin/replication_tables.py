@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from estimation import paper
 from twin.inversion import SPOT_PX, Scalars
-from twin.replication import GOAL, LARGE, Replication, Run, goal, worth_of_modulus
+from twin.replication import GOAL, LARGE, Replication, Run
+from twin.replication_findings import goal, worth_of_modulus
 from twin.report import digits
 
 Floats = NDArray[np.float64]

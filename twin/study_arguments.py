@@ -21,9 +21,9 @@ examples:
 
 _REPLICATE = """\
 The source paper from one command: its Tables I to III, Figs. 3(c), 4 and 5, both protocols, constant
-predictors and earlier methods, beside what it printed. Without --corpus the paper's set is simulated first, into
-OUT/corpus (again continues where it was cut off): about half an hour on two cores with an emulator, longer
-without; --quick is a smaller one at preview quality. Writes report.html, estimates.csv, errors.csv and
+predictors and earlier methods, beside what it printed. Without --corpus the paper's set is simulated first,
+into OUT/corpus (again continues where it was cut off): about half an hour on two cores with an emulator,
+longer without; --quick is a smaller one at preview quality. Writes report.html, estimates.csv, errors.csv and
 replicate.json into OUT.
 
 examples:
