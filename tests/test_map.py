@@ -71,7 +71,9 @@ def test_too_few_and_constants_have_no_line() -> None:
 
 @pytest.fixture(scope="module")
 def corpus(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return painted.paint(tmp_path_factory.mktemp("map"), count=14, blanks=0.1)
+    folder = tmp_path_factory.mktemp("map")
+    (folder / "mine.toml").write_text(painted.small_design().replace("counts = 10.0", "counts = 3.0"))
+    return painted.paint(folder, count=14, blanks=0.1, design="mine.toml")
 
 
 def test_sweep_gives_the_scalars_of_the_stored_pictures(corpus: Path) -> None:
@@ -87,6 +89,7 @@ def test_sweep_gives_the_scalars_of_the_stored_pictures(corpus: Path) -> None:
     first = int(swept.sample[0])
     other = scalars(opened.tared(first, [1])[0], 0.3 * k)
     assert swept.area_px[0, 0] == other["area_px"] and (np.diff(swept.area_px, axis=1) <= 0).all()
+    assert (swept.area_px[:, at] > 0).any()
     assert 0.2 < swept.noise_dn < 3.0
 
 
@@ -119,7 +122,7 @@ def test_two_corpora_are_compared(corpus: Path, tmp_path: Path, capsys: pytest.C
     assert cli.main(["map", str(corpus), str(other), "--out", str(tmp_path / "out")]) == 0
     assert capsys.readouterr().out.count("What to change") == 2
     found = json.loads((tmp_path / "out" / "map.json").read_text())
-    assert ["camera.full_well_e"] == [row[0] for row in found["differences"] if "full_well" in row[0]]
+    assert [row[0] for row in found["differences"] if "full_well" in row[0]] == ["camera.full_well_e"]
     labels = [one["label"] for one in found["corpora"]]
     assert len(set(labels)) == 2
 

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from twin.mapping import PAIRS, Mapped
+from twin.mapping_verdict import state_of
 from twin.report import BLUE, GREEN, GREY, INK, RED, panels
 from twin.thresholds import SIGMAS
 
@@ -55,8 +56,9 @@ def scatter(one: One) -> Figure:
         axis.fill_between(across, low, high, color=BLUE, alpha=0.13, lw=0)
         axis.plot(across, mapped.fit.line(across), color=BLUE, lw=1.6)
         axis.plot(across, mapped.fit.parabola(across), color=RED, lw=1.2, ls="--")
-        verdict = "line adequate" if mapped.fit.adequate else "line not adequate"
-        told = f"R² = {mapped.fit.line.r2:.3f}\nleave-one-out {100 * mapped.fit.error:.1f} %\n{verdict}"
+        told = (
+            f"R² = {mapped.fit.line.r2:.3f}\nleave-one-out {100 * mapped.fit.error:.1f} %\n{state_of(mapped)}"
+        )
         axis.text(0.03, 0.97, told, transform=axis.transAxes, va="top", fontsize=8.5, color=INK)
         axis.set_ylim(top=axis.get_ylim()[1] + 0.12 * np.ptp(axis.get_ylim()))
     _depth_bar(figure, axes, dots)

@@ -18,7 +18,7 @@ from twin.mapping import Mapped, labels, map_corpus, open_corpus
 from twin.mapping_verdict import AtThreshold, area_r2, at_thresholds, headline, verdict
 from twin.report import Page, digits, write_csv, write_json
 from twin.stage import staged
-from twin.thresholds import Swept, sweep
+from twin.thresholds import PICTURE_STEPS, SIGMAS, Swept, sweep
 
 if TYPE_CHECKING:
     from twin.corpus import Corpus
@@ -77,6 +77,7 @@ def study(
         swept = sweep(
             corpus,
             step,
+            picture_k=_thresholds(corpus, step),
             progress=partial(_tell_part, tell, number, len(corpora)),
         )
         rows = [corpus.row(int(sample), step) for sample in swept.sample]
@@ -89,6 +90,14 @@ def study(
         lines = verdict(maps, kind, level, ks, swept.noise_dn, corpus.design.signal.counts)
         found.append(One(label, corpus, maps, kind, level, swept, ks, area_r2(swept), depth, lines))
     return found
+
+
+def _thresholds(corpus: Corpus, step: int) -> list[float]:
+    """Shares of the design's k, and the lowest whole count that noise allows."""
+    k = corpus.design.signal.counts
+    noise = sweep(corpus, step, most=8, surface=False, picture_k=[k]).noise_dn
+    lowest = float(np.ceil(SIGMAS * noise))
+    return sorted({share * k for share in PICTURE_STEPS} | ({lowest} if 0.2 * k <= lowest <= k else set()))
 
 
 def _tell_part(tell: Callable[[str, float], None], part: int, parts: int, done: int, total: int) -> None:
@@ -223,9 +232,8 @@ def _corpus(made: Page, one: One, prefix: str) -> None:
     made.section(f"{prefix}press level, tared or raw")
     made.figure(
         figures.levels(one.maps),
-        "Solid: tared; dashed: raw. Slopes are relative to the tared ones of the shallowest press. Raw "
-        "area is "
-        "constant where all of the probe is in contact, and has no line.",
+        "Solid: tared; dashed: raw. Slopes are relative to the tared ones of the shallowest press (the raw "
+        "maximum's is not drawn). Raw area is constant where all of the probe is in contact, and has no line.",
     )
     made.section(f"{prefix}threshold k")
     made.figure(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from twin.mapping_verdict import state_of
 from twin.report import digits
 
 if TYPE_CHECKING:
@@ -45,7 +46,7 @@ def told(found: Sequence[One]) -> str:
                         digits(row[f"left_out_{name}_percent"], 2)
                         for name in ("linear", "quadratic", "monotone")
                     ),
-                    {True: "adequate", False: "not adequate", None: "none"}[row["adequate"]],
+                    state_of(one),
                 ]
             )
     widths = [max(len(line[i]) for line in [head, *rows]) for i in range(len(head))]

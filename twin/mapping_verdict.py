@@ -125,11 +125,21 @@ def _what(one: Mapped) -> str:
     if one.fit is None:
         return f"{one.pair.name}: {one.why}"
     line, pair = one.fit.line, one.pair
-    state = "line" if one.fit.adequate else "no line"
     return (
         f"{pair.name} {digits(line.slope)} {pair.picture_unit} per {pair.surface_unit}, R² {line.r2:.3f}, "
-        f"leave-one-out {100 * one.fit.error:.1f} % of the span: {state}"
+        f"leave-one-out {100 * one.fit.error:.1f} % of the span: {state_of(one)}"
     )
+
+
+def state_of(one: Mapped) -> str:
+    """Return a word or two for a map: a line, bent but near one, or none."""
+    if one.fit is None:
+        return "none"
+    if one.fit.adequate:
+        return "a line"
+    if one.fit.error <= Limits().tolerance:
+        return f"nearly a line, bent by {100 * one.fit.bow:.1f} %"
+    return "no line"
 
 
 def _where(one: Mapped) -> str:
@@ -189,7 +199,7 @@ def _changes(
     ]
     if scattered:
         found.append(
-            f"do not map {' and '.join(scattered)} by itself: no curve through one scalar comes within "
+            f"do not map {' and '.join(scattered)} one by one: no curve through one scalar comes within "
             f"{100 * Limits().tolerance:g} %, since depth enters; map all three together or train on pictures"
         )
     return found or ["nothing: the lines hold"]

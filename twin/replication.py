@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin import inversion, thresholds
+from twin.complaint import DesignError
 from twin.earlier import Earlier, earlier
 from twin.inversion import Scalars, Variant
 
@@ -29,6 +30,9 @@ MAIN_MM = 2.0
 
 LARGE = np.array([1, 2, 3, 4, 5, 6, 7, 8])
 """Places in Table I of the phantoms of 7 mm and more."""
+
+FEWEST_SEEN = 10
+"""Random inclusions whose pictures must show a spot."""
 
 FROM_MM = 4.0
 """Smallest of the random inclusions that chains are judged by: smaller ones hardly show."""
@@ -191,6 +195,7 @@ def replicate(
         noise_dn=noise,
         levels=levels,
     )
+    _check_seen(levels[depths[main], k], k, source)
     ks = list(dict.fromkeys((k, low)))
     for number, one in enumerate(ks):
         for place, name in enumerate(CANDIDATES):
@@ -245,9 +250,9 @@ def _run_all(
         todo += [(_variant(one), True, (found.main_mm,), k) for one in ("paper", "paper-phantoms")]
     todo.append((_variant(name), True, (found.main_mm,), k_best))
     for mm in depths:
-        todo += [(inversion.PLAIN, False, (mm,), k) for k in ks]
-        todo.append((_variant(name), False, (mm,), k_best))
-    if len(depths) > 1:
+        todo += [(inversion.PLAIN, False, (mm,), k) for k in ks if _shows(found.levels[mm, k])]
+        todo += [(_variant(name), False, (mm,), k_best)] * _shows(found.levels[mm, k_best])
+    if len(depths) > 1 and all(_shows(found.levels[mm, k_best]) for mm in depths):
         todo += [(_variant(name), False, tuple(depths), k_best)]
     todo = list(dict.fromkeys(todo))
     networks: dict[tuple[object, ...], Any] = {}
@@ -266,6 +271,19 @@ def _run_all(
         protocol = "leave-one-out" if left_out else "125/9"
         found.runs.append(Run(variant, protocol, some, k, every.mean(axis=0), every.std(axis=0)))
         tell("networks", (place + 1) / len(todo))
+
+
+def _shows(data: Scalars) -> bool:
+    """Whether enough pictures have a spot for lines through random inclusions and through phantoms."""
+    return bool(data.seen[data.box].sum() >= FEWEST_SEEN and data.seen[data.phantoms].sum() >= 4)
+
+
+def _check_seen(data: Scalars, k_dn: float, source: str) -> None:
+    if not _shows(data):
+        spots = f"{data.seen[data.box].sum()} random inclusions and {data.seen[data.phantoms].sum()} phantoms"
+        received = f"a spot above {k_dn:g} counts for {spots} at {data.level_mm[0]:g} mm"
+        allowed = f"{FEWEST_SEEN} and 4 or more: lower signal.counts, or press deeper"
+        raise DesignError("corpus", received, allowed, source=source)
 
 
 def _lowered(

@@ -155,9 +155,9 @@ def table3(found: Replication) -> tuple[list[str], list[list[str]], str]:
         (f"the same, lines through phantoms, k = {found.k_dn:g}", "paper-phantoms", found.k_dn),
         (f"ours, {name}, k = {k:g}", name, k),
     ):
-        for protocol, short in (("125/9", f"{found.trained}/9"), ("leave-one-out", "LOO")):
+        for protocol, said in (("125/9", f"{found.trained}/9"), ("leave-one-out", "LOO")):
             run = found.run(variant, protocol, (found.main_mm,), threshold)
-            rows.append(_error_row(label, short, truth, run.estimate))
+            rows.append(_error_row(label, said, truth, run.estimate))
     for one in found.earlier:
         rows.append(_error_row(f"{one.name} as guessed", "LOO lines", truth, one.estimate))
     caption = (
