@@ -233,7 +233,7 @@ def _corpus(made: Page, one: One, prefix: str) -> None:
     made.figure(
         figures.levels(one.maps),
         "Solid: tared; dashed: raw. Slopes are relative to the tared ones of the shallowest press (the raw "
-        "maximum's is not drawn). Raw area is constant where all of the probe is in contact, and has no line.",
+        "maximum's is not drawn). Raw area is constant where all of the probe touches, and has no line.",
     )
     made.section(f"{prefix}threshold k")
     made.figure(
