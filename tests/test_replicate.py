@@ -215,7 +215,9 @@ def test_what_e_is_worth_is_said_plainly() -> None:
         explained = 1 - (off**2).mean(axis=0) / np.maximum(truth.var(axis=0), 1e-9)
         half = np.quantile(np.abs(off), 0.9, axis=0)
         one = replication.Crossed(PLAIN, (2.0,), 10.0, estimate, truth, off.std(axis=0), half, explained)
-        found = replication.Replication(400, 1, 0, 2.0, 10.0, 4.0, 0.6, {}, crossed=[one])
+        found = replication.Replication(
+            400, 1, 0, 2.0, 10.0, 4.0, 0.6, {}, crossed=[one], chosen=("paper", 10.0)
+        )
         return replication_findings.worth_of_modulus(found)
 
     assert "worth nothing" in worth(np.broadcast_to(truth.mean(axis=0), truth.shape))

@@ -46,7 +46,7 @@ VARIANTS = (
     Variant("paper-logs", "a line per scalar, network on logarithms", logs=True),
     Variant("paper-split", "a line per scalar, E with a network of its own", split=True),
     Variant("joint", "each surface scalar linear in all three of the picture", "joint"),
-    Variant("joint-split", "the same joint linear map, E with a network of its own", "joint", split=True),
+    Variant("joint-split", "joint linear map, E with a network of its own", "joint", split=True),
     Variant(
         "joint-logs-split",
         "joint map and network between logarithms, E with a network of its own",

@@ -31,7 +31,8 @@ def as_json(found: Replication) -> dict[str, Any]:
     def both(estimate: Floats) -> dict[str, Any]:
         return {"all": figures_of(truth, estimate), "large": figures_of(truth, estimate, LARGE.tolist())}
 
-    best = best_modulus(found)
+    best = found.best()
+    line, off, met = linear(found)
     return {
         "parameters": list(paper.PARAMETERS),
         "paper": {
@@ -83,6 +84,12 @@ def as_json(found: Replication) -> dict[str, Any]:
             "words": worth_of_modulus(found),
         },
         "goal": goal(found),
+        "goal_with_a_linear_mapping": {
+            "variant": line.variant.name,
+            "k_dn": line.k_dn,
+            "rmse": off,
+            "met": met,
+        },
     }
 
 
@@ -102,27 +109,35 @@ def goal(found: Replication) -> dict[str, Any]:
     }
 
 
-def best_modulus(found: Replication) -> Crossed:
-    """Return what did best on E of the random inclusions."""
-    return max(found.crossed, key=lambda one: float(one.explained[2]))
+def linear(found: Replication) -> tuple[Crossed, Floats, bool]:
+    """Return the chain with a linear mapping that did best on the random inclusions, its RMSE (3,) on the
+    large phantoms by 125/9, and whether that meets the goal."""
+    some = [
+        one for one in found.crossed if one.variant.mapping in ("lines", "joint") and not one.variant.logs
+    ]
+    best = min(some, key=lambda one: float(((one.rmse / one.truth.std(axis=0))[:2] ** 2).sum()))
+    run = found.run(best.variant.name, "125/9", (found.main_mm,), best.k_dn)
+    off = paper.rmse(paper.true_inclusions()[LARGE], run.estimate[LARGE])
+    return best, off, all(off[i] <= limit for i, limit in enumerate(GOAL.values()))
 
 
 def worth_of_modulus(found: Replication) -> str:
     """Say plainly what the estimated modulus is worth, from the random inclusions."""
-    best = best_modulus(found)
+    best = found.best()
+    most = max(float(one.explained[2]) for one in found.crossed)
     half, share = float(best.half_width[2]), float(best.explained[2])
     some = best.truth[best.truth[:, 0] >= FROM_MM, 2]
     prior = float(np.quantile(np.abs(some - some.mean()), 0.9))
-    if share < 0.1:
-        verdict = "it is worth nothing: the mean of the training set does as well"
+    if max(share, most) < 0.1:
+        verdict = "it is worth nothing, the mean of the training set does as well"
     elif share < 0.5:
         verdict = "it tells soft from stiff at best"
     else:
         verdict = "it is an estimate"
     return (
-        f"E from three scalars, best chain, random inclusions of 4 mm and more: 90 % lie within "
+        f"E from three scalars (the chosen chain, random inclusions of 4 mm and more): 90 % lie within "
         f"±{half:.0f} kPa "
-        f"of the estimate, "
-        f"within ±{prior:.0f} kPa of a constant; it explains {100 * max(share, 0.0):.0f} % of the "
-        f"variance: {verdict}."
+        f"of the estimate, and within ±{prior:.0f} kPa of a constant; it explains "
+        f"{100 * max(share, 0.0):.0f} % of the "
+        f"variance, the best of all chains {100 * max(most, 0.0):.0f} %: {verdict}."
     )

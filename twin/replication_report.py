@@ -13,7 +13,7 @@ from twin.corpus import Corpus
 from twin.earlier import GUESSES
 from twin.inversion import Scalars
 from twin.replication import LARGE, Replication
-from twin.replication_findings import as_json, best_modulus, worth_of_modulus
+from twin.replication_findings import as_json, worth_of_modulus
 from twin.replication_tables import (
     earlier_table,
     errors_csv,
@@ -223,7 +223,7 @@ def _chains(made: Page, found: Replication) -> None:
 
 
 def _modulus(made: Page, found: Replication) -> None:
-    best = best_modulus(found)
+    best = found.best()
     made.section("What E is worth")
     made.text(worth_of_modulus(found))
     rows = []
@@ -243,7 +243,7 @@ def _modulus(made: Page, found: Replication) -> None:
     made.table(
         ["no.", "true E, kPa", "estimated", "90 % interval", "holds the truth"],
         rows,
-        f"E of the phantoms by the chain that tells most of E ({best.variant.name}, k = {best.k_dn:g}), "
+        f"E of the phantoms by the chosen chain ({best.variant.name}, k = {best.k_dn:g}), "
         f"with the cross-validated interval.",
     )
 

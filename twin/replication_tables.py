@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from estimation import paper
 from twin.inversion import SPOT_PX, Scalars
 from twin.replication import GOAL, LARGE, Replication, Run
-from twin.replication_findings import goal, worth_of_modulus
+from twin.replication_findings import goal, linear, worth_of_modulus
 from twin.report import digits
 
 Floats = NDArray[np.float64]
@@ -48,17 +48,11 @@ def verdict(found: Replication) -> list[str]:
 
 def _linear_line(found: Replication) -> str:
     """What the best chain with a linear mapping does: the three scalars, tared, and a linear map."""
-    linear = [
-        one for one in found.crossed if one.variant.mapping in ("lines", "joint") and not one.variant.logs
-    ]
-    best = min(linear, key=lambda one: float(((one.rmse / one.truth.std(axis=0))[:2] ** 2).sum()))
-    run = found.run(best.variant.name, "125/9", (found.main_mm,), best.k_dn)
-    off = paper.rmse(paper.true_inclusions()[LARGE], run.estimate[LARGE])
-    met = "met" if all(off[i] <= limit for i, limit in enumerate(GOAL.values())) else "not met"
+    best, off, met = linear(found)
     return (
-        f"Best of the chains whose mapping is linear ({best.variant.name}: {best.variant.words}; k = "
-        f"{best.k_dn:g} counts): d "
-        f"{off[0]:.2f} mm, h {off[1]:.2f} mm; goal {met}."
+        f"Best of the chains whose mapping is linear ({best.variant.name}: {best.variant.words}; "
+        f"k = {best.k_dn:g} counts): d {off[0]:.2f} mm, h {off[1]:.2f} mm; goal "
+        f"{'met' if met else 'not met'}."
     )
 
 
@@ -144,7 +138,7 @@ def table3(found: Replication) -> tuple[list[str], list[list[str]], str]:
     truth = paper.true_inclusions()
     printed = paper.published_errors()
     rows = [
-        ["paper, as printed (Table III)", "LOO", *(short(v, i) for i, v in enumerate(printed)), *["—"] * 6],
+        ["paper, as printed (Table III)", "LOO", *(f"{v:.2f}" for v in printed), *["—"] * 6],
         _error_row("paper, from its Table II", "LOO", truth, paper.published_estimates()),
         _error_row("constant: middle of the box", "none", truth, paper.constant(truth, paper.prior_mean())),
         _error_row("constant: mean of the nine", "knows the test", truth, paper.constant(truth)),
