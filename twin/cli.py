@@ -60,6 +60,9 @@ _FLAGS = {
 }
 
 
+# Verbs that go on, when they are called again, where they were cut off.
+_RESUMED = ("emulate", "replicate")
+
 # Rooms whose own errors are one line for the user.
 _ROOMS = ("fem.", "scenes.", "estimation.", "twin.")
 
@@ -81,7 +84,7 @@ def main(argv: list[str] | None = None) -> int:
     except (DesignError, fem.NotModelled, fem.NotConverged, NotModelled, BackendError) as error:
         return _fail(name, _with_flags(str(error)), 2)
     except KeyboardInterrupt:
-        kept = "what was solved is kept" if arguments.verb == "emulate" else "nothing was written"
+        kept = "what was solved is kept" if arguments.verb in _RESUMED else "nothing was written"
         return _fail(name, f"interrupted; {kept}", 130)
     except BrokenPipeError:  # `twin schema | head`
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115 (Python flushes it on its way out)

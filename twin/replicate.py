@@ -19,7 +19,7 @@ CORPUS = "corpus"
 FILES = ("report.html", "estimates.csv", "errors.csv", "replicate.json")
 
 _FULL, _QUICK = "paper", "paper-quick"
-_QUICK_REPEATS = 20
+_QUICK_REPEATS = 10
 
 
 def replicate(
@@ -41,7 +41,7 @@ def replicate(
         OUT/corpus, or gone on with if it is there.
     seed : of the corpus, where it is planned here, and of the networks.
     emulator : file to simulate the corpus by; default emulators/tsis.npz if it is there, but with `quick`.
-    repeats : networks per estimate, default 100, or 20 with `quick`.
+    repeats : networks per estimate, default 100, or 10 with `quick`.
 
     Raises
     ------
