@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
+MOST = 3000
+"""Samples that are mapped: of more, so many at even distances."""
+
 FEWEST = 8
 """Samples with an inclusion that a mapping takes."""
 
@@ -160,6 +163,8 @@ def map_corpus(corpus: Corpus, label: str, level_mm: float | None = None) -> lis
     for level in chosen_levels(corpus, level_mm):
         table = corpus.table
         rows = table[(table["level"] == level) & ~table["blank"]]
+        if len(rows) > MOST:
+            rows = rows.iloc[np.rint(np.linspace(0, len(rows) - 1, MOST)).astype(int)]
         for kind in ("tared", "raw"):
             found += [map_pair(rows, label, corpus.indentation_mm[level], kind, pair) for pair in PAIRS]
     return found

@@ -14,7 +14,7 @@ from pydantic import TypeAdapter
 
 from twin import mapping_figures as figures
 from twin.design import Design
-from twin.mapping import Mapped, labels, map_corpus, open_corpus
+from twin.mapping import MOST, Mapped, labels, map_corpus, open_corpus
 from twin.mapping_verdict import AtThreshold, area_r2, at_thresholds, headline, verdict
 from twin.report import Page, digits, write_csv, write_json
 from twin.stage import staged
@@ -200,6 +200,7 @@ _NOTES = (
     "same press without inclusion. Samples without inclusion are left out; samples without a pixel above k "
     "have "
     "no maximum and no area, and are left out of those two lines.",
+    f"Of corpora of more than {MOST} inclusions, so many at even distances are mapped.",
     "A line counts as adequate where its leave-one-out error is at most 5 % of the span of the picture's "
     "scalar and "
     "its bend is insignificant (p >= 0.05) or below 1 % of the span. The range is the widest run of "
