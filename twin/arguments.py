@@ -98,7 +98,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
 
 
 def _parser() -> Parser:
-    from twin import corpus_arguments  # which takes its readers from here
+    from twin import corpus_arguments, study_arguments  # which takes its readers from here
 
     parser = Parser(
         prog="twin",
@@ -170,6 +170,7 @@ def _parser() -> Parser:
     emulate.add_argument("--out", metavar="FILE.npz", help="the file to write")
 
     corpus_arguments.add(verbs)
+    study_arguments.add(verbs)
     _verb(verbs, "schema", "the JSON schema of a design file", _SCHEMA)
     return parser
 

@@ -1,4 +1,5 @@
-"""The command line: ``twin demo``, ``simulate``, ``check``, ``export``, ``emulate``, ``corpus``, ``schema``.
+"""The command line: ``twin demo``, ``simulate``, ``check``, ``export``, ``emulate``, ``corpus``,
+``map``, ``replicate``, ``schema``.
 
 Exit status 0: done; 1: the machine failed (a full disk); 2: bad input, one line on stderr; 130: interrupted.
 Nothing slow is imported until the input has been checked.
@@ -55,8 +56,12 @@ _FLAGS = {
     "out": "--out",
     "device": "--device",
     "count": "--count",
+    "corpus": "CORPUS",
 }
 
+
+# Verbs that go on, when they are called again, where they were cut off.
+_RESUMED = ("corpus", "emulate", "replicate")
 
 # Rooms whose own errors are one line for the user.
 _ROOMS = ("fem.", "scenes.", "estimation.", "twin.")
@@ -79,8 +84,7 @@ def main(argv: list[str] | None = None) -> int:
     except (DesignError, fem.NotModelled, fem.NotConverged, NotModelled, BackendError) as error:
         return _fail(name, _with_flags(str(error)), 2)
     except KeyboardInterrupt:
-        kept = {"emulate": "what was solved is kept", "corpus": "what is finished stays"}.get(arguments.verb)
-        kept = kept or "nothing was written"
+        kept = "what is finished stays" if arguments.verb in _RESUMED else "nothing was written"
         return _fail(name, f"interrupted; {kept}", 130)
     except BrokenPipeError:  # `twin schema | head`
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115 (Python flushes it on its way out)
@@ -123,6 +127,10 @@ def _run(arguments: argparse.Namespace) -> int:
         from twin import corpus_cli
 
         return corpus_cli.run(arguments)
+    elif arguments.verb in ("map", "replicate"):
+        from twin import study_cli
+
+        return study_cli.run(arguments)
     else:
         parse(["--help"])
     return 0

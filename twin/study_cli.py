@@ -1,0 +1,80 @@
+"""What ``twin map`` and ``twin replicate`` do."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from twin import interrupt
+from twin.complaint import DesignError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the verb of a parsed command line and return the exit status."""
+    return {"map": _map, "replicate": _replicate}[arguments.verb](arguments)
+
+
+@contextmanager
+def _telling() -> Iterator[Callable[[str, float], None]]:
+    from twin.reporting import Reporter
+
+    with Reporter() as report:
+
+        def tell(stage: str, done: float) -> None:
+            interrupt.stop_if_asked()
+            report(stage, done)
+
+        yield tell
+
+
+def _map(arguments: argparse.Namespace) -> int:
+    if len({Path(path).resolve() for path in arguments.corpora}) < len(arguments.corpora):
+        raise DesignError("corpus", "the same folder twice", "different ones")
+    from twin import mapping_report
+    from twin.mapping_text import told
+
+    with _telling() as tell:
+        found = mapping_report.study(arguments.corpora, arguments.level, arguments.raw, tell)
+        if arguments.out is not None:
+            mapping_report.write(found, arguments.out)
+    print(told(found))
+    if arguments.out is not None:
+        print(f"look at: {Path(arguments.out) / 'report.html'}")
+    return 0
+
+
+def _replicate(arguments: argparse.Namespace) -> int:
+    if arguments.out is None:
+        raise DesignError("--out", "nothing", "the folder to make for the report")
+    for flag in ("quick", "emulator", "workers"):
+        if arguments.corpus is not None and getattr(arguments, flag):
+            raise DesignError(f"--{flag}", "it with --corpus", "one of them: that corpus is finished")
+    if arguments.workers == 0:
+        raise DesignError("--workers", "0", "an integer > 0")
+    from twin import replicate
+    from twin.run import Stopped
+
+    try:
+        with _telling() as tell:
+            found = replicate.replicate(
+                arguments.out,
+                corpus=arguments.corpus,
+                quick=arguments.quick,
+                seed=arguments.seed,
+                emulator=arguments.emulator,
+                workers=arguments.workers,
+                progress=tell,
+            )
+    except Stopped as error:
+        print(f"twin replicate: {' '.join(str(error).split())}", file=sys.stderr)
+        return 1
+    print(found)
+    print(f"look at: {Path(arguments.out) / 'report.html'}")
+    return 0
