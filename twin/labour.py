@@ -198,9 +198,14 @@ class WrongCorpus(ValueError):
 
 
 def give_back() -> None:
-    """Return memory that nobody uses to the system: Python's, Dr.Jit's and the C library's."""
+    """Return memory that nobody uses to the system: Python's, Dr.Jit's and the C library's.
+
+    Dr.Jit compiles a kernel anew now and then, and keeps all: a fifth of a MiB a frame. On the disk they are
+    in any case.
+    """
     gc.collect()  # cycles of arrays, some tens of MiB between two collections of Python's own
     if drjit := sys.modules.get("drjit"):
+        drjit.flush_kernel_cache()
         drjit.flush_malloc_cache()
     with suppress(OSError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)

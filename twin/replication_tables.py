@@ -41,8 +41,8 @@ def verdict(found: Replication) -> list[str]:
         f"{k:g} counts): d "
         f"{best['size_mm']:.2f} mm, h {best['depth_mm']:.2f} mm. Goal of {first:g} and {second:g} mm: "
         f"{state}.",
-        "The pick has not seen the phantoms; the list of chains was written by people who had, on a corpus of "
-        "another seed or quality: a corpus with a seed of its own tells whether it holds.",
+        "The pick has not seen the phantoms; the list of chains was written by people who had, on a corpus "
+        "of seed 0: one with a seed of its own tells whether it holds.",
         _linear_line(found),
         worth_of_modulus(found),
     ]
