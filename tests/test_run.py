@@ -112,7 +112,14 @@ def start(corpus: Path, *more: str) -> subprocess.Popen[str]:
     """`twin corpus run` with two workers, in a process group of its own."""
     command = [sys.executable, "-m", "twin", "corpus", "run", str(corpus), *(more or ("--workers", "2"))]
     return subprocess.Popen(
-        command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+        command,
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        # a shell ignores Ctrl-C for what runs in the background, and so would this process
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
 
 

@@ -136,6 +136,7 @@ class Shared:
         self.known: dict[str, str] = {}
         """Hash that the first sample gave for each file."""
         self._users: dict[str, int] = {}
+        self._bad: dict[str, str] = {}
         self._found: list[Problem] = []
         self._lock = threading.Lock()
 
@@ -145,9 +146,10 @@ class Shared:
             if file not in self.known:
                 self.known[file], self._users[file] = sha256, number
                 if why := _changed(self.folder / file, sha256):
-                    match = _SHARED.fullmatch(file)
-                    self._found.append(Problem(file, why, number, match[1] if match else None))
-            elif self.known[file] != sha256:
+                    self._bad[file] = why
+            elif self.known[file] == sha256:
+                self._users[file] = min(self._users[file], number)  # samples come in any order
+            else:
                 where = store.sample_folder(self.folder, number).relative_to(self.folder).as_posix()
                 why = f"gives another SHA-256 for {file} than sample {self._users[file]}"
                 self._found.append(Problem(f"{where}/{store.SAMPLE}", why, number))
@@ -163,7 +165,11 @@ class Shared:
             and not path.name.endswith(".part")
             and (complete or not _SHARED.fullmatch(f"references/{path.name}"))
         ]
-        return self._found + strange
+        bad = []
+        for file, why in sorted(self._bad.items()):
+            match = _SHARED.fullmatch(file)
+            bad.append(Problem(file, why, self._users[file], match[1] if match else None))
+        return bad + self._found + strange
 
 
 def check_places(folder: Path, plan: Plan) -> Iterator[Problem]:
