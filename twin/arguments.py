@@ -109,10 +109,10 @@ def _parser() -> Parser:
     parser.add_argument("--version", action="store_true", help="print the version and stop")
     verbs = parser.add_subparsers(dest="verb", metavar="VERB", title="verbs")
 
-    demo = _verb(verbs, "demo", "the main job on the shipped design and an inclusion of the paper", _DEMO)
+    demo = add_verb(verbs, "demo", "the main job on the shipped design and an inclusion of the paper", _DEMO)
     _add_run_flags(demo, out="tsis-demo")
 
-    simulate = _verb(verbs, "simulate", "one picture, or one per press level", _SIMULATE)
+    simulate = add_verb(verbs, "simulate", "one picture, or one per press level", _SIMULATE)
     simulate.add_argument(
         "design", metavar="DESIGN", nargs="?", default="tsis", help="name or TOML file (default tsis)"
     )
@@ -128,7 +128,7 @@ def _parser() -> Parser:
     )
     _add_run_flags(simulate)
 
-    check = _verb(verbs, "check", "where the light goes, exposure, signal, mistakes: with advice", _CHECK)
+    check = add_verb(verbs, "check", "where the light goes, exposure, signal, mistakes: with advice", _CHECK)
     check.add_argument(
         "design", metavar="DESIGN", nargs="?", default="tsis", help="name or TOML file (default tsis)"
     )
@@ -143,7 +143,7 @@ def _parser() -> Parser:
     check.add_argument("--out", metavar="DIR", help="new folder for check.json and check.png")
     _add_light_flags(check)
 
-    export = _verb(verbs, "export", "a press as files for ParaView, CalculiX, Mitsuba", _EXPORT)
+    export = add_verb(verbs, "export", "a press as files for ParaView, CalculiX, Mitsuba", _EXPORT)
     export.add_argument(
         "design", metavar="DESIGN", nargs="?", default="tsis", help="name or TOML file (default tsis)"
     )
@@ -158,7 +158,7 @@ def _parser() -> Parser:
     kind.add_argument("--ply", metavar="DIR", help="one press as PLY meshes with fields")
     _add_quality_flag(export)
 
-    emulate = _verb(verbs, "emulate", "an emulator of a sensor's contact field", _EMULATE)
+    emulate = add_verb(verbs, "emulate", "an emulator of a sensor's contact field", _EMULATE)
     emulate.add_argument("design", metavar="DESIGN", nargs="?", default="tsis", help="name or TOML file")
     _add_mechanics_flag(emulate)
     emulate.add_argument(
@@ -171,11 +171,12 @@ def _parser() -> Parser:
 
     corpus_arguments.add(verbs)
     study_arguments.add(verbs)
-    _verb(verbs, "schema", "the JSON schema of a design file", _SCHEMA)
+    add_verb(verbs, "schema", "the JSON schema of a design file", _SCHEMA)
     return parser
 
 
-def _verb(verbs: Any, name: str, summary: str, text: str) -> Parser:
+def add_verb(verbs: Any, name: str, summary: str, text: str) -> Parser:
+    """Add a verb, or an action of one, with its --help."""
     verb: Parser = verbs.add_parser(
         name,
         help=summary,

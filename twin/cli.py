@@ -12,8 +12,8 @@ import json
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
@@ -150,24 +150,19 @@ def _simulate(
     from twin.reporting import Reporter, summarise
 
     with staged(arguments.out, holds_frames) as folder, Reporter() as report:
-
-        def tell(stage: str, done: float) -> None:
-            interrupt.stop_if_asked()
-            report(stage, _SIMULATION_SHARE * done)
-
         options = Options(
             quality=arguments.quality,
             noise=arguments.noise,
             seed=arguments.seed,
             device=arguments.device,
-            progress=tell,
+            progress=lambda stage, done: report(stage, _SIMULATION_SHARE * done),
             **(mechanics or {}),
         )
         if by_force:
             frames = simulate(design, inclusion, force=levels, **options)
         else:
             frames = simulate(design, inclusion, levels, **options)
-        tell("files", 1.0)
+        report("files", 1.0)
         fill(frames, folder)
         interrupt.stop_if_asked()
     summarise(frames, Path(arguments.out))
@@ -189,22 +184,23 @@ def _check(arguments: argparse.Namespace) -> None:
                 prescription.fill(None, found, str(arguments.design), place)
         return
     from twin import doctor
+    from twin.reporting import Reporter
 
     with ExitStack() as stack:
         folder: Path | None = None
         if arguments.out is not None:
             folder = stack.enter_context(staged(arguments.out, prescription.holds_checkup))
-        tell = stack.enter_context(_telling())
+        report = stack.enter_context(Reporter())
         checkup = doctor.check_up(
             design,
             arguments.indentation,
             seed=arguments.seed,
             device=arguments.device,
-            progress=lambda stage, done: tell(stage, _SIMULATION_SHARE * done),
+            progress=lambda stage, done: report(stage, _SIMULATION_SHARE * done),
         )
         found = findings.findings(checkup)
         if folder is not None:
-            tell("files", 1.0)
+            report("files", 1.0)
             prescription.fill(checkup, found, design.name, folder)
         interrupt.stop_if_asked()
     prescription.show(checkup, found, design.name, as_json=arguments.json)
@@ -214,6 +210,7 @@ def _check(arguments: argparse.Namespace) -> None:
 
 def _export(arguments: argparse.Namespace, design: Design, inclusion: fem.Inclusion | None) -> None:
     from twin import export, export_optics
+    from twin.reporting import Reporter
 
     if arguments.ccx is not None:
         levels = arguments.indentation or design.press.indentation_mm
@@ -224,9 +221,9 @@ def _export(arguments: argparse.Namespace, design: Design, inclusion: fem.Inclus
     for kind in export_optics.KINDS:
         if (name := getattr(arguments, kind)) is not None:
             export_optics.check(design, inclusion, levels)
-            with _telling() as tell:
+            with Reporter() as report:
                 place = export_optics.export(
-                    design, inclusion, levels, kind, name, quality=arguments.quality, progress=tell
+                    design, inclusion, levels, kind, name, quality=arguments.quality, progress=report
                 )
             print(f"folder: {place} (README.txt says what is in it)")
             return
@@ -235,25 +232,11 @@ def _export(arguments: argparse.Namespace, design: Design, inclusion: fem.Inclus
         raise DesignError(flags, "nothing", "one of them, with what to write")
     name = arguments.vtu
     export.check(design, inclusion, levels, "vtu", name)
-    with _telling() as tell:
+    with Reporter() as report:
         target = export.export(
-            design, inclusion, levels, "vtu", name, quality=arguments.quality, progress=tell
+            design, inclusion, levels, "vtu", name, quality=arguments.quality, progress=report
         )
     print(f"file: {target}")
-
-
-@contextmanager
-def _telling() -> Iterator[Callable[[str, float], None]]:
-    """A progress bar that also hears Ctrl-C."""
-    from twin.reporting import Reporter
-
-    with Reporter() as report:
-
-        def tell(stage: str, done: float) -> None:
-            interrupt.stop_if_asked()
-            report(stage, done)
-
-        yield tell
 
 
 def _emulate(arguments: argparse.Namespace) -> None:
@@ -267,11 +250,6 @@ def _emulate(arguments: argparse.Namespace) -> None:
             raise DesignError(f"--{flag}", "0", "an integer > 0")
     design = load_design(arguments.design).pressed(mechanics=arguments.mechanics)
     with Reporter() as report:
-
-        def tell(stage: str, done: float) -> None:
-            interrupt.stop_if_asked()
-            report("solves" if stage[-1].isdigit() else stage, done)
-
         built = emulate(
             design,
             arguments.out,
@@ -279,7 +257,7 @@ def _emulate(arguments: argparse.Namespace) -> None:
             samples=arguments.samples,
             workers=arguments.workers,
             seed=arguments.seed,
-            progress=tell,
+            progress=lambda stage, done: report("solves" if stage[-1].isdigit() else stage, done),
         )
     print(summary(built, arguments.out))
 

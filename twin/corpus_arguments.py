@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import argparse
 from typing import Any
 
-from twin.arguments import MECHANICS, QUALITIES, Parser, choice, number, whole
+from twin.arguments import MECHANICS, QUALITIES, add_verb, choice, number, whole
 
 _CORPUS = """\
 Corpora: thousands of labelled pictures to train on, resumable and verifiable. See CORPORA.md.
@@ -81,7 +80,7 @@ examples:
 
 def add(verbs: Any) -> None:
     """Add the verb and its actions to the parser of `twin.arguments`."""
-    corpus = _parser(verbs, "corpus", "training corpora: plan, run, status, verify, export, card", _CORPUS)
+    corpus = add_verb(verbs, "corpus", "training corpora: plan, run, status, verify, export, card", _CORPUS)
     actions = corpus.add_subparsers(dest="action", metavar="ACTION", title="actions", required=True)
     _add_plan(actions)
     _add_run(actions)
@@ -91,19 +90,8 @@ def add(verbs: Any) -> None:
     _add_card(actions)
 
 
-def _parser(place: Any, name: str, summary: str, text: str) -> Parser:
-    parser: Parser = place.add_parser(
-        name,
-        help=summary,
-        description=text,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
-    return parser
-
-
 def _add_plan(actions: Any) -> None:
-    plan = _parser(actions, "plan", "freeze a study; how long and how large it will be", _PLAN)
+    plan = add_verb(actions, "plan", "freeze a study; how long and how large it will be", _PLAN)
     plan.add_argument("study", metavar="STUDY", help="name of a shipped study, or a TOML file")
     plan.add_argument("--out", metavar="DIR", help="new folder for the corpus")
     plan.add_argument("--seed", type=whole, metavar="N", help="of all random numbers (default: the study's)")
@@ -132,7 +120,7 @@ def _add_plan(actions: Any) -> None:
 
 
 def _add_run(actions: Any) -> None:
-    run = _parser(actions, "run", "make what is missing", _RUN)
+    run = add_verb(actions, "run", "make what is missing", _RUN)
     run.add_argument("directory", metavar="DIR", help="folder of the corpus")
     run.add_argument(
         "--workers", type=whole, metavar="N", help="processes on this machine (default: one per core)"
@@ -146,13 +134,13 @@ def _add_run(actions: Any) -> None:
 
 
 def _add_status(actions: Any) -> None:
-    status = _parser(actions, "status", "what is there, missing, failed and why", _STATUS)
+    status = add_verb(actions, "status", "what is there, missing, failed and why", _STATUS)
     status.add_argument("directory", metavar="DIR", help="folder of the corpus")
     status.add_argument("--json", action="store_true", help="as JSON on stdout")
 
 
 def _add_verify(actions: Any) -> None:
-    verify = _parser(actions, "verify", "hashes, index and a few samples made again", _VERIFY)
+    verify = add_verb(actions, "verify", "hashes, index and a few samples made again", _VERIFY)
     verify.add_argument("directory", metavar="DIR", help="folder of the corpus")
     verify.add_argument(
         "--resimulate", type=whole, default=2, metavar="N", help="random samples to make again (default 2)"
@@ -167,7 +155,7 @@ def _add_verify(actions: Any) -> None:
 
 
 def _add_export(actions: Any) -> None:
-    export = _parser(actions, "export", "WebDataset, Hugging Face or PNG", _EXPORT)
+    export = add_verb(actions, "export", "WebDataset, Hugging Face or PNG", _EXPORT)
     export.add_argument("directory", metavar="DIR", help="folder of the corpus")
     formats = ("webdataset", "hf", "png")
     export.add_argument("--format", type=choice(*formats), metavar="F", help=", ".join(formats))
@@ -185,5 +173,5 @@ def _add_export(actions: Any) -> None:
 
 
 def _add_card(actions: Any) -> None:
-    card = _parser(actions, "card", "README.md and figures of what is there", _CARD)
+    card = add_verb(actions, "card", "README.md and figures of what is there", _CARD)
     card.add_argument("directory", metavar="DIR", help="folder of the corpus")

@@ -6,7 +6,6 @@ import argparse
 import sys
 from collections.abc import Callable
 
-from twin import interrupt
 from twin.complaint import DesignError, shown
 
 
@@ -25,11 +24,6 @@ def _plan(arguments: argparse.Namespace) -> int:
     from twin.reporting import Reporter
 
     with Reporter() as report:
-
-        def tell(stage: str, done: float) -> None:
-            interrupt.stop_if_asked()
-            report(stage, done)
-
         plan = freeze(
             arguments.study,
             arguments.out,
@@ -39,14 +33,14 @@ def _plan(arguments: argparse.Namespace) -> int:
             quality=arguments.quality,
             light=arguments.light,
             count=arguments.count,
-            progress=tell,
+            progress=report,
         )
     print(described(plan), flush=True)
     if arguments.no_probe:
         return 0
     try:
         with Reporter() as report:
-            cost = measure(plan, tell)
+            cost = measure(plan, report)
     except KeyboardInterrupt:
         print("twin corpus plan: interrupted in the probe; the plan is written", file=sys.stderr)
         return 130
@@ -115,11 +109,6 @@ def _verify(arguments: argparse.Namespace) -> int:
     from twin.verify import verify
 
     with Reporter() as report:
-
-        def tell(stage: str, done: float) -> None:
-            interrupt.stop_if_asked()
-            report(stage, done)
-
         try:
             found = verify(
                 arguments.directory,
@@ -127,7 +116,7 @@ def _verify(arguments: argparse.Namespace) -> int:
                 seed=arguments.seed,
                 workers=arguments.workers,
                 repair=arguments.repair,
-                progress=tell,
+                progress=report,
             )
         except Stopped as error:
             return _failed("verify", str(error))
@@ -176,11 +165,7 @@ def _write_card(directory: str) -> None:
 
 
 def _told(report: Callable[[str, float], None], stage: str) -> Callable[[int, int], None]:
-    def tell(done: int, total: int) -> None:
-        interrupt.stop_if_asked()
-        report(stage, done / total)
-
-    return tell
+    return lambda done, total: report(stage, done / total)
 
 
 def _failed(action: str, line: str) -> int:

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+from twin import interrupt
 from twin.captions import inclusion_in_words, mechanics_in_words
 from twin.frame import Frame
 
@@ -23,7 +24,8 @@ SATURATED_PERCENT = 0.1
 class Reporter:
     """Progress on stderr: a bar with the time left on a terminal, otherwise one line per finished stage.
 
-    Call it with a stage's name when the stage starts, and the share of all work that is done by then.
+    Call it with a stage's name when the stage starts, and the share of all work that is done by then. Each
+    call also hears Ctrl-C (`interrupt.stop_if_asked`).
     """
 
     def __init__(self) -> None:
@@ -49,6 +51,7 @@ class Reporter:
             self._close_stage()
 
     def __call__(self, stage: str, done: float) -> None:
+        interrupt.stop_if_asked()
         if self._bar:
             self._bar.update(self._task, description=stage, completed=done)
         elif stage != self._stage:

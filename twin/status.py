@@ -9,6 +9,7 @@ from collections import Counter
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from scenes import exr
 from twin import store
 from twin.occupied import holder, leftovers
 from twin.plan import load_plan
@@ -113,17 +114,23 @@ def _grouped(failed: dict[int, str]) -> list[Reason]:
 
 
 def _rate(folder: Path, done: set[int]) -> float | None:
+    """Samples a minute of late, from when the first of them was begun to when the last was done."""
     times = []
     for number in done:
         try:
-            times.append(os.stat(store.sample_folder(folder, number) / store.SAMPLE).st_mtime)
+            times.append((os.stat(store.sample_folder(folder, number) / store.SAMPLE).st_mtime, number))
         except OSError:
             continue
     times.sort()
-    recent = [moment for moment in times if moment >= times[-1] - _SPAN_S]
-    if len(recent) < 3 or recent[-1] <= recent[0]:
+    recent = [(moment, number) for moment, number in times if moment >= times[-1][0] - _SPAN_S]
+    if len(recent) < 3 or recent[-1][0] <= recent[0][0]:
         return None
-    return 60.0 * (len(recent) - 1) / (recent[-1] - recent[0])
+    first, number = recent[0]
+    try:
+        took = sum(store.read_note(folder, number).seconds.values())
+    except exr.ImageError:
+        return None
+    return 60.0 * len(recent) / (recent[-1][0] - first + took)
 
 
 def _size(folder: Path) -> int:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import argparse
 from typing import Any
 
-from twin.arguments import Parser, number, whole
+from twin.arguments import add_verb, number, whole
 
 _MAP = """\
 Validate the mapping from the contact surface to the picture on one corpus or several: the paper's three
@@ -35,7 +34,7 @@ examples:
 
 def add(verbs: Any) -> None:
     """Add both verbs to the parser of `twin.arguments`."""
-    mapping = _parser(verbs, "map", "the surface-to-picture mapping of a corpus, validated", _MAP)
+    mapping = add_verb(verbs, "map", "the surface-to-picture mapping of a corpus, validated", _MAP)
     mapping.add_argument(
         "corpora", metavar="CORPUS", nargs="+", help="folder of a corpus; several are compared"
     )
@@ -45,7 +44,7 @@ def add(verbs: Any) -> None:
         "--raw", action="store_true", help="figures and verdict of raw scalars, not tared ones"
     )
 
-    replicate = _parser(
+    replicate = add_verb(
         verbs, "replicate", "the source paper, table by table and figure by figure", _REPLICATE
     )
     replicate.add_argument("--out", metavar="DIR", help="new folder for the report, and for the corpus")
@@ -60,14 +59,3 @@ def add(verbs: Any) -> None:
     replicate.add_argument(
         "--workers", type=whole, metavar="N", help="processes to simulate with (default: all cores)"
     )
-
-
-def _parser(place: Any, name: str, summary: str, text: str) -> Parser:
-    parser: Parser = place.add_parser(
-        name,
-        help=summary,
-        description=text,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
-    return parser

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from twin import interrupt
 from twin.complaint import DesignError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    pass
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -21,27 +18,15 @@ def run(arguments: argparse.Namespace) -> int:
     return {"map": _map, "replicate": _replicate}[arguments.verb](arguments)
 
 
-@contextmanager
-def _telling() -> Iterator[Callable[[str, float], None]]:
-    from twin.reporting import Reporter
-
-    with Reporter() as report:
-
-        def tell(stage: str, done: float) -> None:
-            interrupt.stop_if_asked()
-            report(stage, done)
-
-        yield tell
-
-
 def _map(arguments: argparse.Namespace) -> int:
     if len({Path(path).resolve() for path in arguments.corpora}) < len(arguments.corpora):
         raise DesignError("corpus", "the same folder twice", "different ones")
     from twin import mapping_report
     from twin.mapping_text import told
+    from twin.reporting import Reporter
 
-    with _telling() as tell:
-        found = mapping_report.study(arguments.corpora, arguments.level, arguments.raw, tell)
+    with Reporter() as report:
+        found = mapping_report.study(arguments.corpora, arguments.level, arguments.raw, report)
         if arguments.out is not None:
             mapping_report.write(found, arguments.out)
     print(told(found))
@@ -59,10 +44,11 @@ def _replicate(arguments: argparse.Namespace) -> int:
     if arguments.workers == 0:
         raise DesignError("--workers", "0", "an integer > 0")
     from twin import replicate
+    from twin.reporting import Reporter
     from twin.run import Stopped
 
     try:
-        with _telling() as tell:
+        with Reporter() as report:
             found = replicate.replicate(
                 arguments.out,
                 corpus=arguments.corpus,
@@ -70,7 +56,7 @@ def _replicate(arguments: argparse.Namespace) -> int:
                 seed=arguments.seed,
                 emulator=arguments.emulator,
                 workers=arguments.workers,
-                progress=tell,
+                progress=report,
             )
     except Stopped as error:
         print(f"twin replicate: {' '.join(str(error).split())}", file=sys.stderr)
