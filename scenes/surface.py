@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +11,9 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.interpolate import CloughTocher2DInterpolator, RectBivariateSpline
 from scipy.ndimage import map_coordinates
+
+# It does without what fails, an interruption too (heard again: `twin.interrupt`), and would log a traceback.
+logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 Array = NDArray[np.float64]
 

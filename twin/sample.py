@@ -84,7 +84,8 @@ def lit(plan: Plan, number: int, contacts: list[Contact], seconds: float, corpus
         for level, contact in enumerate(contacts):
             plain = plan.inclusion(number) is None
             rendering = _render(design, contact, "pressure_0" if plain else "pressure", plan.light, light)
-            reference = _reference(plan, number, level, contact, corpus, folder)
+            same = rendering if plain else None
+            reference = _reference(plan, number, level, contact, corpus, folder, same)
             began = time.perf_counter()
             image = take(design, rendering.radiance, camera, contact.level_mm)
             record = {
@@ -131,9 +132,18 @@ class _Reference:
 
 
 def _reference(
-    plan: Plan, number: int, level: int, contact: Contact, corpus: Path, folder: Path
+    plan: Plan,
+    number: int,
+    level: int,
+    contact: Contact,
+    corpus: Path,
+    folder: Path,
+    same: Rendering | None = None,
 ) -> _Reference:
-    """Return the reference of one level, of the sample's own or shared with all samples of equal light."""
+    """Return the reference of one level, of the sample's own or shared with all samples of equal light.
+
+    ``same`` is its light, where the sample is blank and has it already.
+    """
     design, (light, camera) = plan.design(number), plan.seeds(number)
     if plan.shares_references:
         key = _key(plan, contact, light)
@@ -144,7 +154,7 @@ def _reference(
     else:
         folder_name = store.sample_folder(corpus, number).relative_to(corpus)
         name, place, seed = f"{folder_name}/{level}.reference", folder / f"{level}.reference", camera
-    rendering = _render(design, contact, "pressure_0", plan.light, light)
+    rendering = same or _render(design, contact, "pressure_0", plan.light, light)
     counts = take_reference(design, rendering.radiance, seed, contact.level_mm)
     record = {
         "press": {"nominal_mm": plan.indentation_mm[level], "indentation_mm": contact.level_mm},
