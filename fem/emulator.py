@@ -8,6 +8,7 @@ it.
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -203,8 +204,27 @@ class Emulator:
 
 def fields(emulator: Emulator, slab: Slab, inclusion: Inclusion | None, depth: float) -> dict[str, Floats]:
     """The fields of `Emulated.surface` on the grid, (m, m) and (m, m, 3), at an indentation in mm."""
+    return fields_at(emulator, slab, inclusion, (depth,))[0]
+
+
+def fields_at(
+    emulator: Emulator, slab: Slab, inclusion: Inclusion | None, depths: Sequence[float]
+) -> list[dict[str, Floats]]:
+    """`fields` at several indentations in mm, of which the specimen's share is worked out once."""
+    levels = [lagrange(emulator.plan.levels, depth) for depth in depths]
+    added = [None for _ in levels] if inclusion is None else signals(emulator, slab, inclusion, levels)
+    return [
+        _pressed(emulator, slab, depth, level, more)
+        for depth, level, more in zip(depths, levels, added, strict=True)
+    ]
+
+
+def _pressed(
+    emulator: Emulator, slab: Slab, depth: float, level: Floats, added: tuple[Floats, Floats] | None
+) -> dict[str, Floats]:
+    """`fields` at one indentation, with what the inclusion adds to it."""
     plan, tissue = emulator.plan, slab.modulus_kPa
-    at, level = knots(plan), lagrange(plan.levels, depth)
+    at = knots(plan)
     weights = np.multiply.outer(
         lagrange(at[0], 1 / slab.thickness_mm), lagrange(at[1], float(np.log(tissue)))
     )
@@ -215,8 +235,8 @@ def fields(emulator: Emulator, slab: Slab, inclusion: Inclusion | None, depth: f
     pressure_0 = depth * tissue * background(emulator.pressure, level)
     displacement_0 = depth * background(emulator.moved, level)
     pressure, displacement = pressure_0, displacement_0
-    if inclusion is not None:
-        rise, tared = signal(emulator, slab, inclusion, level)
+    if added is not None:
+        rise, tared = added
         unit = np.tensordot(weights, emulator.pressure[:, :, 0], 2)
         pressure = pressure_0 + rise * depth * tissue * unit
         displacement = displacement_0 + depth * tared
@@ -227,8 +247,10 @@ def fields(emulator: Emulator, slab: Slab, inclusion: Inclusion | None, depth: f
     return found
 
 
-def signal(emulator: Emulator, slab: Slab, inclusion: Inclusion, level: Floats) -> tuple[Floats, Floats]:
-    """Rise (m, m) and tared displacement per mm (m, m, 3) on the grid; level: weights of the levels."""
+def signals(
+    emulator: Emulator, slab: Slab, inclusion: Inclusion, levels: Sequence[Floats]
+) -> list[tuple[Floats, Floats]]:
+    """Rise (m, m) and tared displacement per mm (m, m, 3) on the grid, for weights (l,) of levels each."""
     plan = emulator.plan
     x, y = inclusion.offset
     big, small = max(abs(x), abs(y)), min(abs(x), abs(y))
@@ -241,28 +263,27 @@ def signal(emulator: Emulator, slab: Slab, inclusion: Inclusion, level: Floats) 
         emulator.rise(linear).reshape(len(along), -1)
         + emulator.finer(linear[:, CENTRED]).reshape(len(along), -1)
     )
-    parts = [
-        _on_grid(
-            geometry,
-            plan.resolution,
-            emulator.x,
-            rise,
-            along @ emulator.tared(linear).reshape(len(along), -1),
-        )
-    ]
+    onto = resample(geometry, plan.resolution, emulator.x)
+    first = _on_grid(onto, rise, along @ emulator.tared(linear).reshape(len(along), -1))
+    stretch = None
     if emulator.rise_more is not None and emulator.tared_more is not None:
-        more = (r(inputs).reshape(len(level) - 1, -1) for r in (emulator.rise_more, emulator.tared_more))
-        parts.append(_on_grid(geometry, plan.coarse, emulator.x, *(level[1:] @ m for m in more)))
-    scales = amplitudes(point, s)
-    rise, tared = (scale * sum(part) for scale, part in zip(scales, zip(*parts, strict=True), strict=True))
-    return unfold(rise, tared, (x, y))
+        stretch = [
+            r(inputs).reshape(len(levels[0]) - 1, -1) for r in (emulator.rise_more, emulator.tared_more)
+        ]
+        onto = resample(geometry, plan.coarse, emulator.x)
+    scales, found = amplitudes(point, s), []
+    for level in levels:
+        parts = [first]
+        if stretch is not None:
+            parts.append(_on_grid(onto, *(level[1:] @ more for more in stretch)))
+        whole = (sum(part) for part in zip(*parts, strict=True))
+        rise, tared = (scale * part for scale, part in zip(scales, whole, strict=True))
+        found.append(unfold(rise, tared, (x, y)))
+    return found
 
 
-def _on_grid(
-    geometry: Geometry, res: Resolution, x: Floats, rise: Floats, tared: Floats
-) -> tuple[Floats, Floats]:
-    """Carry fields from a mesh's nodes, flat, to the grid, (m, m) and (m, m, 3)."""
-    onto = resample(geometry, res, x)
+def _on_grid(onto: tuple[Floats, Floats], rise: Floats, tared: Floats) -> tuple[Floats, Floats]:
+    """Carry fields from a mesh's nodes, flat, to the grid, (m, m) and (m, m, 3); see `resample`."""
     n = onto[0].shape[1]
     each = tared.reshape(n, n, 3).transpose(2, 0, 1)
     return onto[0] @ rise.reshape(n, n) @ onto[1].T, np.stack(
