@@ -30,7 +30,6 @@ class LightMap:
     curved : how many leading inputs go in with squares and products.
     weights : (terms, pixels)
     shape : of a picture.
-    residual : (pixels,) root mean square error of pictures that were left out of the fit.
     """
 
     centre: Single
@@ -38,16 +37,19 @@ class LightMap:
     curved: int
     weights: Single
     shape: tuple[int, ...]
-    residual: Single
 
     def inputs(self, contacts: NDArray[np.floating]) -> Single:
         """Inputs (n, k) of contacts (n, d)."""
         return np.asarray((np.asarray(contacts, np.float32) - self.centre) @ self.axes)
 
+    def at(self, inputs: Single) -> Single:
+        """Pictures (n, *shape) of inputs (n, k)."""
+        found = terms(inputs, self.curved) @ self.weights
+        return np.asarray(found.reshape(-1, *self.shape), np.float32)
+
     def __call__(self, contacts: NDArray[np.floating]) -> Single:
         """Pictures (n, *shape) of contacts (n, d)."""
-        found = terms(self.inputs(contacts), self.curved) @ self.weights
-        return np.asarray(found.reshape(-1, *self.shape), np.float32)
+        return self.at(self.inputs(contacts))
 
 
 def terms(inputs: Single, curved: int) -> Single:
@@ -70,8 +72,8 @@ def learn(
     *,
     k: int = 40,
     curved: int = 10,
-) -> LightMap:
-    """Fit pictures (n, ...) of contacts (n, d).
+) -> tuple[LightMap, Single]:
+    """Fit pictures (n, ...) of contacts (n, d); return also the errors of those left out, (n, ...).
 
     Parameters
     ----------
@@ -105,11 +107,8 @@ def learn(
         rows = groups == group
         hat = a[rows] @ inverse @ a[rows].T
         left[rows] = np.linalg.solve(np.eye(rows.sum()) - hat, error[rows])
-    return LightMap(
-        centre.astype(np.float32),
-        axes.astype(np.float32),
-        curved,
-        weights.astype(np.float32),
-        np.asarray(pictures).shape[1:],
-        np.sqrt((left**2).mean(axis=0)).astype(np.float32),
+    shape = np.asarray(pictures).shape
+    fitted = LightMap(
+        centre.astype(np.float32), axes.astype(np.float32), curved, weights.astype(np.float32), shape[1:]
     )
+    return fitted, left.reshape(shape).astype(np.float32)

@@ -28,7 +28,7 @@ _INPUTS, _CURVED = 10, 4  # principal components, and how many of them go in wit
 _MODES = 10
 _COARSE = 50  # cells per side on which modes are kept
 _FINE = 100  # on which their mean is
-_BEYOND = 1.5  # how far inputs may leave what was learned, times its reach
+_BEYOND = 2.0  # how far inputs may leave what was learned, times its reach
 FORMAT = "tsis-traced-1"
 
 
