@@ -9,7 +9,7 @@ import zipfile
 import zlib
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,8 +50,8 @@ def save_emulator(emulator: Emulator, place: str | Path) -> None:
         rough.unlink(missing_ok=True)
 
 
-def load_emulator(place: str | Path) -> Emulator:
-    """Read an emulator; nothing in the file is trusted: no pickles, all shapes and numbers are checked.
+def load_emulator(place: str | Path | BinaryIO) -> Emulator:
+    """Read an emulator from a file; nothing in the file is trusted: no pickles, all shapes and numbers are checked.
 
     Raises
     ------
@@ -61,7 +61,7 @@ def load_emulator(place: str | Path) -> Emulator:
         Where there is no such file.
     """
     try:
-        arrays = _read(Path(place).read_bytes())
+        arrays = _read(Path(place).read_bytes() if isinstance(place, str | Path) else place.read())
         return _checked(arrays)
     except (
         KeyError,

@@ -25,7 +25,7 @@ from twin.study import PARAMETERS, parse_study
 
 Single = NDArray[np.float32]
 
-WANTED = PARAMETERS[:3]
+WANTED = PARAMETERS
 _AT_ONCE = 64  # specimens whose contacts are worked out together
 _DRAWS = 4  # of noise for every specimen
 
@@ -149,7 +149,7 @@ def simulate(
     Parameters
     ----------
     inputs : (n, levels, 2, k) of the light map.
-    ranges : (3, 2) of `WANTED`, which become 0 to 1.
+    ranges : (5, 2) of `WANTED`, which become 0 to 1.
     error : (m, k) features of the light map's errors.
     """
     n, onto = len(inputs), features.onto

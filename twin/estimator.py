@@ -1,0 +1,274 @@
+"""A trained estimator: from a sensor's pictures to the posterior of the inclusion's size, depth and modulus.
+
+A model is two files: NAME.safetensors holds arrays only (network, light map, features, likeness, the emulator
+of the mechanics), NAME.json its card. Neither can run code.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors
+import safetensors.numpy
+import torch
+from numpy.typing import NDArray
+
+import fem
+from estimation import novelty
+from estimation.features import Features
+from estimation.light_map import LightMap
+from estimation.posterior import MOST_FRAMES, REFERENCE_FRAMES, Posterior, restored
+from twin.chain import BLOCK, Chain
+from twin.complaint import DesignError, shown
+from twin.design import parse_design
+from twin.estimates import NAMES, Estimate
+from twin.fitting import Fitted, Prior, fit
+from twin.imagined import noise_variance
+from twin.received import Received
+from twin.retake import average
+
+FORMAT = "tsis-estimator-1"
+_CARD_BYTES = 4 * 2**20
+_NEEDED = {
+    "design": dict,
+    "shape": list,
+    "bits": int,
+    "colour": str,
+    "indentation_mm": list,
+    "frames": list,
+    "ranges": dict,
+    "refuse_below": float,
+    "network": dict,
+    "light": dict,
+    "features": list,
+    "nuisances": list,
+    "sha256": str,
+}
+
+Single = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Estimator:
+    """What a sensor's pictures tell, as it was trained; see `load_estimator`."""
+
+    card: dict[str, Any]
+    chain: Chain
+    features: Features
+    network: Posterior
+    prior: Prior
+    error: NDArray[np.float64]
+    """(k, k) covariance of the features' errors of the chain."""
+    novelty: Mapping[str, NDArray[Any]]
+
+    def estimate(self, received: Received, *, samples: int = 4000, seed: int = 0) -> Estimate:
+        """Return what is known after the pictures; ``samples`` of the posterior are drawn from ``seed``."""
+        seen, frames = self.coarse(received), exposures(received)
+        told = self.features(seen[None])
+        drawn = self.unscaled(self.network.sample(told, frames, samples, seed)[0])
+        fitted = self.fitted(seen, frames, drawn.mean(axis=0))
+        wanted = drawn[:, : len(NAMES)]
+        likeness = float(novelty.score(self.novelty, self.features.stacked(seen[None]))[0])
+        gain = np.array([self.chain.gain(self.prior.values(fitted.x))])
+        variance = noise_variance(self.chain.design, seen[None], gain)[0] / np.array(
+            [frames, max(frames, REFERENCE_FRAMES)]
+        ).reshape(2, 1, 1)
+        reason = None
+        if likeness < self.card["refuse_below"]:
+            reason = f"pictures less like this sensor's than {100 * (1 - self.card['refuse_below']):g} % of its own"
+        return Estimate(
+            NAMES,
+            wanted,
+            wanted.mean(axis=0),
+            np.cov(wanted.T),
+            np.percentile(wanted, [5.0, 95.0], axis=0).T,
+            float(self.network.present(told, frames)[0]),
+            likeness,
+            reason,
+            np.asarray(seen[:, 0] - seen[:, 1], np.float64),
+            np.asarray(fitted.pictures[:, 0] - fitted.pictures[:, 1], np.float64),
+            np.sqrt(variance.sum(axis=1, dtype=np.float64)),
+        )
+
+    def coarse(self, received: Received) -> Single:
+        """Return coarse counts above black, (levels, 2, r, c)."""
+        both = zip(received.images, received.references, strict=True)
+        found = np.stack([np.stack([average(_cut(one), BLOCK) for one in pair]) for pair in both])
+        return np.asarray(found - black(self.chain), np.float32)
+
+    def unscaled(self, unit: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Parameters (..., 5) from 0 to 1."""
+        low, high = self.prior.ranges.T
+        return np.asarray(low + (high - low) * unit)
+
+    def fitted(self, seen: Single, frames: float, start: NDArray[np.floating]) -> Fitted:
+        """Return the most probable specimen by the chain, from a start (5,)."""
+        begin = np.concatenate([start, np.zeros(self.prior.basis.shape[1])])
+        return fit(
+            self.chain, self.features, self.prior, self.features(seen[None])[0], frames, begin, self.error
+        )
+
+
+def black(chain: Chain) -> float:
+    """Counts of a pixel without light."""
+    return chain.design.camera.offset_dn + chain.dark_dn / chain.design.camera.gain_e_per_dn
+
+
+def exposures(received: Received) -> float:
+    """Return the exposures that pictures count as, where references are the mean of few."""
+    variance = 1.0 / received.frames
+    if received.reference_frames < max(received.frames, REFERENCE_FRAMES):
+        variance += 1.0 / received.reference_frames - 1.0 / max(received.frames, REFERENCE_FRAMES)
+    return float(np.clip(1.0 / variance, 1.0, MOST_FRAMES))
+
+
+def _cut(picture: NDArray[np.floating]) -> Single:
+    """Leave out rows and columns beyond the last whole block."""
+    rows, columns = (side // block * block for side, block in zip(picture.shape, BLOCK, strict=True))
+    return np.asarray(picture[:rows, :columns], np.float32)
+
+
+def save_estimator(estimator: Estimator, emulator: Path, path: str | Path) -> Path:
+    """Write NAME.safetensors and NAME.json; ``path`` is the former's. The card is written last."""
+    target = Path(path)
+    arrays: dict[str, NDArray[Any]] = {"emulator": np.frombuffer(emulator.read_bytes(), np.uint8)}
+    parts: dict[str, Any] = {"light": estimator.chain.light, "features": estimator.features}
+    for name, part in parts.items():
+        arrays |= {
+            f"{name}.{field.name}": getattr(part, field.name)
+            for field in fields(part)
+            if isinstance(getattr(part, field.name), np.ndarray)
+        }
+    prior = estimator.prior
+    arrays |= {"prior.ranges": prior.ranges, "prior.mean": prior.mean, "prior.basis": prior.basis}
+    arrays |= {"error": estimator.error}
+    arrays |= {f"novelty.{name}": np.asarray(value) for name, value in estimator.novelty.items()}
+    arrays |= {f"network.{k}": v.detach().numpy() for k, v in estimator.network.state_dict().items()}
+    data = safetensors.numpy.save({name: np.ascontiguousarray(value) for name, value in arrays.items()})
+    card = {
+        **estimator.card,
+        "format": FORMAT,
+        "network": estimator.network.size,
+        "light": {"curved": estimator.chain.light.curved, "shape": list(estimator.chain.light.shape)},
+        "features": list(estimator.features.shape),
+        "nuisances": list(prior.names),
+        "sha256": hashlib.sha256(data).hexdigest(),
+    }
+    target.parent.mkdir(parents=True, exist_ok=True)
+    for place, text in (
+        (target, data),
+        (card_of(target), (json.dumps(card, indent=1, allow_nan=False) + "\n").encode()),
+    ):
+        part = place.with_name(f".{place.name}.{os.getpid()}.part")
+        part.write_bytes(text)
+        os.replace(part, place)
+    return target
+
+
+def card_of(path: Path) -> Path:
+    """Return the place of a model's card."""
+    return path.with_suffix(".json")
+
+
+def load_estimator(path: str | Path) -> Estimator:
+    """Return a trained estimator; nothing in its files is trusted.
+
+    Raises
+    ------
+    DesignError
+        In one line.
+    """
+    place = Path(path)
+    name = str(place)
+    if place.suffix != ".safetensors" or not place.is_file() or not card_of(place).is_file():
+        allowed = "a .safetensors file of `twin train`, its .json beside it"
+        raise DesignError("MODEL", shown(name), allowed)
+    try:
+        card = _card(card_of(place))
+        data = place.read_bytes()
+        if hashlib.sha256(data).hexdigest() != card["sha256"]:
+            raise DesignError("sha256", "other arrays", "those that the card tells of", source=name)
+        return _assembled(card, safetensors.numpy.load(data))
+    except DesignError as error:
+        raise error.renamed(source=error.source or name) from None
+    except (
+        OSError,
+        KeyError,
+        ValueError,
+        TypeError,
+        OverflowError,
+        RecursionError,
+        safetensors.SafetensorError,
+    ) as error:
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise DesignError("MODEL", f"files that do not fit ({reason})", "those of `twin train`", source=name) from None
+
+
+def _card(place: Path) -> dict[str, Any]:
+    if place.stat().st_size > _CARD_BYTES:
+        raise ValueError("the card is too long")
+    card = json.loads(place.read_bytes())
+    if not isinstance(card, dict) or card.get("format") != FORMAT:
+        raise ValueError(f"format is not {FORMAT}")
+    for name, kind in _NEEDED.items():
+        if not isinstance(card.get(name), kind):
+            raise ValueError(f"{name} is not {kind.__name__}")
+    return card
+
+
+def _assembled(card: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Estimator:
+    for name, value in arrays.items():
+        if value.dtype.kind == "f" and not np.isfinite(value).all():
+            raise ValueError(f"{name} is not finite")
+    design = parse_design(card["design"])
+    said = card["light"]
+    light = LightMap(
+        arrays["light.centre"],
+        arrays["light.axes"],
+        int(said["curved"]),
+        arrays["light.weights"],
+        tuple(int(side) for side in said["shape"]),
+    )
+    pixels = int(np.prod(light.shape))
+    features = Features(
+        *(arrays[f"features.{name}"] for name in ("mean", "axes", "noise", "spread")),
+        shape=tuple(int(side) for side in card["features"]),
+    )
+    k = len(features.spread)
+    prior = Prior(
+        arrays["prior.ranges"], tuple(map(str, card["nuisances"])), arrays["prior.mean"], arrays["prior.basis"]
+    )
+    fits = (
+        light.axes.shape[0] == len(light.centre)
+        and light.weights.shape[1] == pixels
+        and features.axes.shape == (k, int(np.prod(features.shape)))
+        and features.shape[0] == len(design.press.indentation_mm)
+        and features.shape[2:] == light.shape[1:]
+        and light.shape[0] == len(design.leds)
+        and arrays["error"].shape == (k, k)
+        and prior.ranges.shape == (5, 2)
+        and prior.basis.shape[0] == len(prior.names) == len(prior.mean)
+    )
+    if not fits:
+        raise ValueError("shapes")
+    state = {
+        name.removeprefix("network."): torch.from_numpy(value.copy())
+        for name, value in arrays.items()
+        if name.startswith("network.")
+    }
+    network = restored(card["network"], state)
+    if network.size["k"] != k or network.size["p"] != 5:
+        raise ValueError("network.size")
+    emulator = fem.load_emulator(BytesIO(arrays["emulator"].tobytes()))
+    strange = {
+        name.removeprefix("novelty."): value for name, value in arrays.items() if name.startswith("novelty.")
+    }
+    return Estimator(card, Chain(design, emulator, light), features, network, prior, arrays["error"], strange)

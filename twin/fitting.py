@@ -1,0 +1,216 @@
+"""The model-based estimator: the most probable specimen by the chain, and the bound from the same chain.
+
+Pictures are features (`estimation.features`) with normal noise; what is not known has a normal prior, the
+inclusion's that of a uniform draw from its ranges. Gauss-Newton steps with halving lead to the most probable
+values (Kay 1993, section 11.5; [kay1993]); derivatives are central differences of the chain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimation.features import Features
+from twin.chain import Chain
+from twin.imagined import Brightness, noise_variance, pictures
+from twin.study import PARAMETERS
+
+Floats = NDArray[np.float64]
+
+REFERENCE_FRAMES = 16
+_STEPS = {"size_mm": 0.02, "depth_mm": 0.02, "modulus_kPa": 0.5, "offset_x_mm": 0.02, "offset_y_mm": 0.02}
+_NUISANCE_STEP = 0.1  # standard deviations
+_MOST = 12  # Gauss-Newton steps
+_DONE = 0.01  # step in standard deviations that ends them
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is known before: of `PARAMETERS` their ranges (5, 2), of all else that varies a normal law.
+
+    Attributes
+    ----------
+    names : of the other numbers.
+    mean, basis : (m,) and (m, q); they are mean + basis @ t with independent t of variance one.
+    """
+
+    ranges: Floats
+    names: tuple[str, ...]
+    mean: Floats
+    basis: Floats
+
+    @property
+    def precision(self) -> Floats:
+        """(5 + q, 5 + q) of all unknowns."""
+        spans = np.maximum(self.ranges[:, 1] - self.ranges[:, 0], 1e-9)
+        return np.diag([*(12.0 / spans**2), *np.ones(self.basis.shape[1])])
+
+    @property
+    def middle(self) -> Floats:
+        """(5 + q,) the prior's mean."""
+        return np.concatenate([self.ranges.mean(axis=1), np.zeros(self.basis.shape[1])])
+
+    def values(self, x: Floats) -> dict[str, float]:
+        """Return the values by name of unknowns (5 + q,)."""
+        others = self.mean + self.basis @ x[5:]
+        return {
+            **{name: float(value) for name, value in zip(PARAMETERS, x[:5], strict=True)},
+            **{name: float(value) for name, value in zip(self.names, others, strict=True)},
+        }
+
+    def unknowns(self, values: Mapping[str, float]) -> Floats:
+        """Return the unknowns (5 + q,) nearest to values by name."""
+        others = np.array([values[name] for name in self.names]) - self.mean
+        inner = np.linalg.lstsq(self.basis, others, rcond=None)[0]
+        return np.concatenate([[values[name] for name in PARAMETERS], inner])
+
+
+def prior_of(ranges: Floats, drawn: Sequence[Mapping[str, float]]) -> Prior:
+    """Return the prior of specimens that were drawn: ranges (5, 2), and the spread of all else."""
+    names = tuple(name for name in drawn[0] if name not in PARAMETERS)
+    if not names:
+        return Prior(ranges, (), np.zeros(0), np.zeros((0, 0)))
+    table = np.array([[one[name] for name in names] for one in drawn])
+    mean = table.mean(axis=0)
+    scale = np.maximum(table.std(axis=0), 1e-12)
+    values, vectors = np.linalg.eigh(np.cov((table - mean).T / scale[:, None]).reshape(len(names), -1))
+    keep = values > 1e-6 * values.max()
+    return Prior(ranges, names, mean, scale[:, None] * vectors[:, keep] * np.sqrt(values[keep]))
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """The most probable unknowns (5 + q,), their covariance, chi-square over features, expected pictures."""
+
+    x: Floats
+    covariance: Floats
+    chi_square: float
+    pictures: NDArray[np.float32]
+
+
+def expected(chain: Chain, prior: Prior, many: Sequence[Floats]) -> NDArray[np.float32]:
+    """Return expected counts above black (n, levels, 2, r, c) at unknowns (5 + q,) each."""
+    values = [prior.values(x) for x in many]
+    contact = [tuple(v for k, v in one.items() if not _bright(k)) for one in values]
+    first: dict[tuple[float, ...], int] = {}
+    for key in contact:
+        first.setdefault(key, len(first))
+    chosen = [values[contact.index(key)] for key in first]
+    inputs = chain.inputs(chosen)[[first[key] for key in contact]]
+    return pictures(chain, inputs, Brightness.of(chain, values))
+
+
+def _bright(name: str) -> bool:
+    return name.startswith("leds.") or name == "camera.gain_e_per_dn"
+
+
+def jacobian(chain: Chain, features: Features, prior: Prior, x: Floats) -> tuple[NDArray[np.float32], Floats]:
+    """Return the pictures (levels, 2, r, c) at unknowns x, and derivatives (5 + q, k) of their features."""
+    steps = np.array([*(_STEPS[name] for name in PARAMETERS), *[_NUISANCE_STEP] * (len(x) - 5)])
+    ends = []
+    for number, step in enumerate(steps):
+        for sign in (-1.0, 1.0):
+            end = x.copy()
+            end[number] += sign * step
+            if number < 5:
+                end[number] = np.clip(end[number], *prior.ranges[number])
+            ends.append(end)
+    seen = expected(chain, prior, [x, *ends])
+    found = features(seen[1:]).astype(np.float64)
+    apart = np.array([ends[2 * n + 1][n] - ends[2 * n][n] for n in range(len(x))])
+    return seen[0], (found[1::2] - found[::2]) / apart[:, None]
+
+
+def covariance(
+    chain: Chain, features: Features, seen: NDArray[np.floating], gain: float, frames: float
+) -> Floats:
+    """Return the covariance (k, k) of the features' noise in pictures (levels, 2, r, c) of so many exposures.
+
+    References are the mean of `REFERENCE_FRAMES` at least.
+    """
+    variance = noise_variance(chain.design, seen[None], np.array([gain]))[0].reshape(*seen.shape[:2], -1)
+    total = np.zeros((len(features.spread),) * 2)
+    onto = features.onto
+    for place, count in ((0, frames), (1, max(frames, REFERENCE_FRAMES))):
+        for level in range(len(seen)):
+            axes = onto[level, place]
+            total += (axes * (variance[level, place] / count)[:, None]).T @ axes
+    return total
+
+
+def fit(
+    chain: Chain,
+    features: Features,
+    prior: Prior,
+    observed: NDArray[np.floating],
+    frames: float,
+    start: Floats,
+    error: Floats | None = None,
+) -> Fitted:
+    """Return the most probable specimen for features (k,) of pictures that are means of so many exposures.
+
+    Parameters
+    ----------
+    start : (5 + q,) where to begin.
+    error : (k, k) covariance of the chain's own errors.
+    """
+    x, precision = _inside(prior, start), prior.precision
+    found: Fitted | None = None
+    for _ in range(_MOST):
+        seen, slopes = jacobian(chain, features, prior, x)
+        gain = chain.gain(prior.values(x))
+        noise = covariance(chain, features, seen, gain, frames) + (0.0 if error is None else error)
+        weighted = np.linalg.solve(noise, slopes.T)
+        rest = observed - features(seen[None])[0]
+        information = slopes @ weighted + precision
+        step = np.linalg.solve(information, weighted.T @ rest - precision @ (x - prior.middle))
+        inverse = np.asarray(np.linalg.inv(information))
+        found = Fitted(x, inverse, float(rest @ np.linalg.solve(noise, rest)), seen)
+        size = np.abs(step) / np.sqrt(np.diag(inverse))
+        x = _inside(prior, _stepped(chain, features, prior, x, step, observed, noise))
+        if size.max() < _DONE:
+            break
+    assert found is not None
+    return found
+
+
+def _stepped(
+    chain: Chain,
+    features: Features,
+    prior: Prior,
+    x: Floats,
+    step: Floats,
+    observed: NDArray[np.floating],
+    noise: Floats,
+) -> Floats:
+    """Go the longest of a few halved steps that lowers the sum of squares."""
+    shares = (0.0, 1.0, 0.5, 0.2, 0.05)
+    tried = [_inside(prior, x + share * step) for share in shares]
+    rest = observed - features(expected(chain, prior, tried))
+    away = np.stack(tried) - prior.middle
+    cost = np.einsum("nk,nk->n", rest, np.linalg.solve(noise, rest.T).T)
+    cost += np.einsum("ni,ij,nj->n", away, prior.precision, away)
+    return tried[int(np.argmin(cost))]
+
+
+def _inside(prior: Prior, x: Floats) -> Floats:
+    inner = x.copy()
+    inner[:5] = np.clip(x[:5], prior.ranges[:, 0], prior.ranges[:, 1])
+    inner[5:] = np.clip(x[5:], -4.0, 4.0)
+    return inner
+
+
+def bound(
+    chain: Chain, features: Features, prior: Prior, values: Mapping[str, float], frames: float
+) -> Floats:
+    """Return the prior-included bound (5 + q, 5 + q) at true values: (J C⁻¹ Jᵀ + P)⁻¹.
+
+    Raises `fem.NotModelled` where the chain cannot go.
+    """
+    x = prior.unknowns(values)
+    seen, slopes = jacobian(chain, features, prior, x)
+    noise = covariance(chain, features, seen, chain.gain(prior.values(x)), frames)
+    return np.asarray(np.linalg.inv(slopes @ np.linalg.solve(noise, slopes.T) + prior.precision))
