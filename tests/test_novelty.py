@@ -106,7 +106,7 @@ def test_arrays_go_through_a_file(stored, world, tmp_path):
 def test_wrong_arrays_are_one_line(stored, world):
     draw, _, _ = world
     for given in ((draw(2), draw(50)), (draw(50), draw(19)), (draw(50), draw(50)[:, 1:])):
-        with pytest.raises(ValueError, match="received shape .* allowed"):
+        with pytest.raises(ValueError, match=r"received shape .* allowed"):
             novelty.fit(*given)
     with pytest.raises(ValueError, match="held_out: received NaN"):
         novelty.fit(draw(50), np.full((50, LENGTH), np.nan))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,3 +35,36 @@ class Received:
     def tared(self) -> NDArray[np.float32]:
         """(levels, rows, columns[, 3]) counts of the pictures minus those of the references."""
         return self.images - self.references
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """The pictures that a model can take."""
+
+    shape: tuple[int, int]
+    """Rows and columns."""
+    bits: int
+    colour: str
+    """mono or rgb."""
+    indentation_mm: tuple[float, ...]
+    """Press levels, in order."""
+    frames: tuple[int, int]
+    """Fewest and most exposures that a picture may be the mean of."""
+
+    @property
+    def levels(self) -> int:
+        """How many press levels there are."""
+        return len(self.indentation_mm)
+
+    @property
+    def planes(self) -> tuple[int, ...]:
+        """Shape of one picture: rows, columns, and 3 in colour."""
+        return self.shape if self.colour == "mono" else (*self.shape, 3)
+
+
+def wanted_of(card: Mapping[str, Any]) -> Wanted:
+    """Return what the card of a model says of its pictures."""
+    rows, columns = card["shape"]
+    least, most = card["frames"]
+    levels = tuple(float(depth) for depth in card["indentation_mm"])
+    return Wanted((int(rows), int(columns)), int(card["bits"]), card["colour"], levels, (least, most))
