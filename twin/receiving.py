@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -60,7 +61,7 @@ def receive(
     if isinstance(exposures, bool) or exposures < 1:
         raise DesignError("--frames", shown(exposures), "an integer > 0")
     places = [Path(frame) for frame in frames]
-    folders = [place for place in places if place.is_dir()]
+    folders = [place for place in places if os.path.isdir(place)]  # False for any odd name
     if not folders:
         return _from_camera(places, [Path(name) for name in references], wanted, exposures, flip)
     if len(folders) < len(places):
@@ -85,9 +86,9 @@ def _from_camera(
     if several > _MOST_FRAMES:
         raise DesignError("--reference", f"{several} a level", f"at most {_MOST_FRAMES}")
     _check_frames(exposures, wanted)
-    twice = {place.resolve() for place in references} & {place.resolve() for place in files}
+    twice = {os.path.abspath(place) for place in references} & {os.path.abspath(place) for place in files}
     if twice:
-        raise DesignError("--reference", f"{min(twice).name}, which is a FRAME too", "other files")
+        raise DesignError("--reference", f"{min(twice)}, which is a FRAME too", "other files")
     images, plain = [], []
     for level in range(wanted.levels):
         images.append(_mean(files[level * exposures : (level + 1) * exposures], wanted))
