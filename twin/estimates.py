@@ -41,3 +41,8 @@ class Estimate:
     observed: NDArray[np.float64]
     predicted: NDArray[np.float64]
     noise: NDArray[np.float64]
+
+
+def probability(value: float) -> str:
+    """Return a probability in three figures, never as a certainty that no posterior has."""
+    return "> 0.999" if value > 0.9995 else "< 0.001" if value < 0.0005 else f"{value:.3f}"
