@@ -58,6 +58,7 @@ def real_camera(
     lit: ArrayLike,
     plain: ArrayLike,
     seed: int = 0,
+    shot: int = 0,
     *,
     frames: int = 1,
     reference_frames: int = 16,
@@ -67,11 +68,13 @@ def real_camera(
     """Pictures of light through `other_camera`, misaligned by so many per cent in every way.
 
     ``lit`` and ``plain`` are (levels, rows, columns[, 3]) W m⁻² sr⁻¹, all LEDs together, with and without
-    inclusion. Shift along both axes (of the width), magnification and turn (0.01 rad) have random signs.
+    inclusion. Shift along both axes (of the width), magnification and turn (0.01 rad) have random signs,
+    which are the seed's; the noise is that of seed and shot.
     """
     rng = np.random.default_rng([seed, 4])
     camera = other_camera(design.camera) if camera is None else camera
     sign = rng.choice([-1.0, 1.0], 4) * 0.01 * percent
+    rng = np.random.default_rng([seed, 5, shot])
     step = (sign[0] * design.camera.shape[1], sign[1] * design.camera.shape[1])
 
     def taken(light: ArrayLike, count: int) -> NDArray[np.float32]:

@@ -6,7 +6,7 @@ for smooth differences and noise.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
@@ -16,6 +16,7 @@ from scipy.ndimage import gaussian_filter
 
 from twin.design import Design
 from twin.estimates import NAMES, Estimate
+from twin.fields import tables_of
 from twin.received import Received
 from twin.sound import coarse
 
@@ -63,7 +64,7 @@ def card_of(design: Design, levels: tuple[float, ...]) -> dict[str, Any]:
     camera = design.camera
     return {
         "design_sha256": "0" * 64,
-        "design": asdict(design),
+        "design": tables_of(design),
         "shape": list(camera.shape),
         "bits": camera.bits,
         "colour": camera.colour,

@@ -12,7 +12,7 @@ import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -184,24 +184,36 @@ def _from_folders(folders: list[Path], wanted: Wanted, exposures: int) -> Receiv
         if len(group) != exposures:
             raise DesignError("FRAME", f"{len(group)} at {depth:g} mm", f"{exposures} at each press level")
     read = [[_simulated(*pair, wanted) for pair in group] for group in by_level]
-    counts = {(sum(one[2] for one in group), sum(one[3] for one in group)) for group in read}
+    counts = {(sum(one.frames for one in g), sum(one.reference_frames for one in g)) for g in read}
     if len(counts) > 1:
         raise DesignError("FRAME", "unlike numbers of exposures", "equal ones at all press levels")
     ((frames, several),) = counts
     _check_frames(frames, wanted)
-    for group, names in zip(read, by_level, strict=True):
-        for number, one in enumerate(group[1:], start=1):
-            check_same(group[0][0], one[0], wanted.bits, (str(names[0][0]), str(names[number][0])))
+    for group in read:
+        for other in group[1:]:
+            check_same(group[0].image, other.image, wanted.bits, (group[0].name, other.name))
+    images = [_weighted([(one.image, one.frames) for one in group]) for group in read]
+    plain = [_weighted([(one.reference, one.reference_frames) for one in group]) for group in read]
     return _checked(
         Received(
-            images=np.stack([_weighted([(one[0], one[2]) for one in group]) for group in read]),
-            references=np.stack([_weighted([(one[1], one[3]) for one in group]) for group in read]),
+            images=np.stack(images),
+            references=np.stack(plain),
             frames=frames,
             reference_frames=several,
             bits=wanted.bits,
-            names=tuple(str(group[0][0]) for group in by_level),
+            names=tuple(group[0].name for group in read),
         )
     )
+
+
+class _Frame(NamedTuple):
+    """What a folder of one frame holds."""
+
+    image: Float
+    reference: Float
+    frames: int
+    reference_frames: int
+    name: str
 
 
 def _weighted(parts: list[tuple[Float, int]]) -> Float:
@@ -210,8 +222,7 @@ def _weighted(parts: list[tuple[Float, int]]) -> Float:
     return np.asarray(mean, np.float32)
 
 
-def _simulated(folder: Path, record: dict[str, Any], wanted: Wanted) -> tuple[Float, Float, int, int]:
-    """Picture and reference of one frame's folder, and of how many exposures each is the mean."""
+def _simulated(folder: Path, record: dict[str, Any], wanted: Wanted) -> _Frame:
     averaged = (folder / MEAN).is_file()
     frames = _count(record, "frames", None if averaged else 1, folder)
     several = _count(record, "reference_frames", max(REFERENCE_FRAMES, frames), folder)
@@ -223,7 +234,7 @@ def _simulated(folder: Path, record: dict[str, Any], wanted: Wanted) -> tuple[Fl
     reference = _counts(folder / "reference.exr", record, wanted)
     check_exposure(image, wanted.bits, str(folder))
     check_exposure(reference, wanted.bits, str(folder / "reference.exr"))
-    return image, reference, frames, several
+    return _Frame(image, reference, frames, several, str(folder))
 
 
 def _counts(place: Path, record: dict[str, Any], wanted: Wanted) -> Float:
