@@ -24,6 +24,7 @@ from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import eigh
 from scipy.ndimage import map_coordinates
 
 Float = NDArray[np.float64]
@@ -54,20 +55,36 @@ def fit(
     if not 0.0 <= tolerance < 1.0:
         raise ValueError(f"tolerance: received {tolerance!r}, allowed: 0 to 1")
     mean = basis.mean(axis=0)
-    _, singular, across = np.linalg.svd(basis - mean, full_matrices=False)
-    count = min(components, len(basis) // 2, int(np.sum(singular > 1e-9 * singular[0])))
-    if count < 1:
+    spread, across = _principal(basis - mean, min(components, len(basis) // 2))
+    if len(spread) < 1:
         raise ValueError(f"components: received {components!r}, allowed: >= 1, of pictures that vary")
     stored = {
         "mean": mean,
-        "components": across[:count],
-        "spread": singular[:count] / np.sqrt(len(basis) - 1),
+        "components": across,
+        "spread": spread,
         "tolerance": np.array([tolerance]),
     }
     found = np.concatenate([_statistics(stored, others), _extra(extra, len(others))], axis=1)
     stored["ranks"] = np.sort(found, axis=0)
     stored["smallest"] = np.sort(_tails(stored, found).min(axis=1))
     return stored
+
+
+def _principal(centred: Float, most: int) -> tuple[Float, Float]:
+    """Standard deviations along the first principal components, (k,), and these, (k, m).
+
+    By eigenvectors of the smaller of both products, which is many times as fast as singular values are; what
+    it loses, components a ten-thousandth as strong as the first, is far below any picture's noise.
+    """
+    count, length = centred.shape
+    wide = length > count
+    product = centred @ centred.T if wide else centred.T @ centred
+    values, vectors = eigh(product, subset_by_index=[max(len(product) - most, 0), len(product) - 1])
+    values, vectors = values[::-1], vectors[:, ::-1]
+    kept = values > 1e-10 * max(float(values[0]), 1e-300)
+    values, vectors = values[kept], vectors[:, kept]
+    across = (centred.T @ vectors / np.sqrt(values)).T if wide else vectors.T
+    return np.sqrt(values / (count - 1)), np.ascontiguousarray(across)
 
 
 def score(
@@ -111,7 +128,7 @@ def misaligned(pictures: ArrayLike, rng: np.random.Generator, percent: float = 1
         turned = np.cos(turn) * grid + np.sin(turn) * np.stack([grid[1], -grid[0]])
         at = turned / (1.0 + larger) + middle + max(rows, columns) * np.array([y, x])[:, None, None]
         for level, target in zip(picture, place, strict=True):
-            map_coordinates(level, at, output=target, order=1, mode="nearest")
+            map_coordinates(level, at, output=target, order=3, mode="nearest")
     return out
 
 

@@ -184,16 +184,16 @@ def _from_folders(folders: list[Path], wanted: Wanted, exposures: int) -> Receiv
         if len(group) != exposures:
             raise DesignError("FRAME", f"{len(group)} at {depth:g} mm", f"{exposures} at each press level")
     read = [[_simulated(*pair, wanted) for pair in group] for group in by_level]
-    counts = {(sum(one.frames for one in g), sum(one.reference_frames for one in g)) for g in read}
+    counts = {(sum(one.frames for one in same), sum(one.reference_frames for one in same)) for same in read}
     if len(counts) > 1:
         raise DesignError("FRAME", "unlike numbers of exposures", "equal ones at all press levels")
     ((frames, several),) = counts
     _check_frames(frames, wanted)
-    for group in read:
-        for other in group[1:]:
-            check_same(group[0].image, other.image, wanted.bits, (group[0].name, other.name))
-    images = [_weighted([(one.image, one.frames) for one in group]) for group in read]
-    plain = [_weighted([(one.reference, one.reference_frames) for one in group]) for group in read]
+    for first, *others in read:
+        for other in others:
+            check_same(first.image, other.image, wanted.bits, (first.name, other.name))
+    images = [_weighted([(one.image, one.frames) for one in same]) for same in read]
+    plain = [_weighted([(one.reference, one.reference_frames) for one in same]) for same in read]
     return _checked(
         Received(
             images=np.stack(images),
@@ -201,7 +201,7 @@ def _from_folders(folders: list[Path], wanted: Wanted, exposures: int) -> Receiv
             frames=frames,
             reference_frames=several,
             bits=wanted.bits,
-            names=tuple(group[0].name for group in read),
+            names=tuple(same[0].name for same in read),
         )
     )
 
