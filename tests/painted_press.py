@@ -24,7 +24,7 @@ def small(**camera: object) -> Design:
 
 
 def painted_light(
-    design: Design, levels: tuple[float, ...], blob: float = 0.4, x_mm: float = 0.0
+    design: Design, levels: tuple[float, ...], blob: float = 0.4, x_mm: float = 0.0, wide_mm2: float = 20.0
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Light with and without a blob, (levels, rows, columns[, 3]) W m⁻² sr⁻¹; brighter the deeper (mm)."""
     camera = design.camera
@@ -32,7 +32,7 @@ def painted_light(
     x = ((np.arange(columns) + 0.5) / columns - 0.5) * camera.field_of_view_mm
     y = (0.5 - (np.arange(rows) + 0.5) / rows)[:, None] * camera.field_height_mm
     plain = np.exp(-((x / 14) ** 2) - (y / 12) ** 2)
-    lit = plain * (1 + blob * np.exp(-((x - x_mm) ** 2 + y**2) / 20))
+    lit = plain * (1 + blob * np.exp(-((x - x_mm) ** 2 + y**2) / wide_mm2))
     bright = np.array(levels)[:, None, None] * 0.25
     both = np.stack([bright * lit, bright * plain])
     if camera.colour == "rgb":

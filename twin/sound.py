@@ -19,7 +19,8 @@ APART = 0.01
 SHOWN = 0.4
 """Least share of a reference's fixed pattern that its picture must show."""
 
-_BLOCK = 12
+BLOCK = 12
+"""Pixels along a side of the blocks of a coarse picture."""
 
 
 def check_exposure(picture: NDArray[np.floating], bits: int, name: str) -> None:
@@ -91,10 +92,10 @@ def _pixelwise(counts: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.asarray(((a - b) - (c - d)) / 2 / level)
 
 
-def coarse(picture: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Means of blocks of 12 x 12 pixels, without what is left over at the right and lower border."""
+def coarse(picture: NDArray[np.floating], block: int = BLOCK) -> NDArray[np.float64]:
+    """Means of square blocks of pixels, without what is left over at the right and lower border."""
     counts = grey(picture)
-    block = min(_BLOCK, *counts.shape)
+    block = min(block, *counts.shape)
     rows, columns = counts.shape[0] // block, counts.shape[1] // block
     cut = counts[: rows * block, : columns * block]
     return np.asarray(cut.reshape(rows, block, columns, block).mean(axis=(1, 3)))
