@@ -8,6 +8,7 @@ it.
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -203,8 +204,44 @@ class Emulator:
 
 def fields(emulator: Emulator, slab: Slab, inclusion: Inclusion | None, depth: float) -> dict[str, Floats]:
     """The fields of `Emulated.surface` on the grid, (m, m) and (m, m, 3), at an indentation in mm."""
-    plan, tissue = emulator.plan, slab.modulus_kPa
-    at, level = knots(plan), lagrange(plan.levels, depth)
+    found = fields_of(emulator, [(slab, inclusion, (depth,))])[0][0]
+    areas = {
+        f"area{suffix}": _area(emulator.x, found["displacement" + suffix], emulator.plan.finite)
+        for suffix in ("", "_0")
+    }
+    return {**found, **areas}
+
+
+def fields_of(
+    emulator: Emulator, cases: Sequence[tuple[Slab, Inclusion | None, Sequence[float]]]
+) -> list[list[dict[str, Floats]]]:
+    """`fields` but for the areas, of many specimens at several indentations each, in mm.
+
+    Regressions are worked out for all together, a specimen's share of its presses once.
+    """
+    there = [(slab, inclusion) for slab, inclusion, _ in cases if inclusion is not None]
+    learned = iter(_learned(emulator, there))
+    found = []
+    for slab, inclusion, depths in cases:
+        levels = [lagrange(emulator.plan.levels, depth) for depth in depths]
+        added: Sequence[tuple[Floats, Floats] | None] = [None for _ in levels]
+        if inclusion is not None:
+            added = _signals(emulator, slab, inclusion, levels, next(learned))
+        found.append(
+            [
+                _pressed(emulator, slab, depth, level, more)
+                for depth, level, more in zip(depths, levels, added, strict=True)
+            ]
+        )
+    return found
+
+
+def _pressed(
+    emulator: Emulator, slab: Slab, depth: float, level: Floats, added: tuple[Floats, Floats] | None
+) -> dict[str, Floats]:
+    """`fields` at one indentation, with what the inclusion adds to it."""
+    tissue = slab.modulus_kPa
+    at = knots(emulator.plan)
     weights = np.multiply.outer(
         lagrange(at[0], 1 / slab.thickness_mm), lagrange(at[1], float(np.log(tissue)))
     )
@@ -215,54 +252,81 @@ def fields(emulator: Emulator, slab: Slab, inclusion: Inclusion | None, depth: f
     pressure_0 = depth * tissue * background(emulator.pressure, level)
     displacement_0 = depth * background(emulator.moved, level)
     pressure, displacement = pressure_0, displacement_0
-    if inclusion is not None:
-        rise, tared = signal(emulator, slab, inclusion, level)
+    if added is not None:
+        rise, tared = added
         unit = np.tensordot(weights, emulator.pressure[:, :, 0], 2)
         pressure = pressure_0 + rise * depth * tissue * unit
         displacement = displacement_0 + depth * tared
     found = {}
     for suffix, p, u in (("", pressure, displacement), ("_0", pressure_0, displacement_0)):
         found["displacement" + suffix], found["pressure" + suffix] = u, np.maximum(p, 0.0)
-        found["area" + suffix] = _area(emulator.x, u, plan.finite)
     return found
 
 
-def signal(emulator: Emulator, slab: Slab, inclusion: Inclusion, level: Floats) -> tuple[Floats, Floats]:
-    """Rise (m, m) and tared displacement per mm (m, m, 3) on the grid; level: weights of the levels."""
-    plan = emulator.plan
-    x, y = inclusion.offset
-    big, small = max(abs(x), abs(y)), min(abs(x), abs(y))
-    s = float(contrast(np.array(inclusion.modulus / slab.modulus_kPa)))
-    point = np.array([inclusion.size, inclusion.depth, big, small, slab.thickness_mm, slab.modulus_kPa, s])
-    geometry = Geometry(plan.probe, slab, replace(inclusion, offset=(big, small)))
-    along, inputs = lagrange(contrast(plan.ratios), s), features(plan, point[None])
+@dataclass(frozen=True)
+class _Learned:
+    """What the regressions say of a specimen: fields over the ratios (k, ...), of a lean mesh over levels."""
+
+    point: Floats
+    rise: Floats
+    tared: Floats
+    more: tuple[Floats, Floats] | None
+
+
+def _learned(emulator: Emulator, specimens: Sequence[tuple[Slab, Inclusion]]) -> list[_Learned]:
+    """Work the regressions out for all specimens at once."""
+    if not specimens:
+        return []
+    plan, points = emulator.plan, np.empty((len(specimens), 7))
+    for number, (slab, inclusion) in enumerate(specimens):
+        away = sorted((abs(along) for along in inclusion.offset), reverse=True)
+        s = float(contrast(np.array(inclusion.modulus / slab.modulus_kPa)))
+        points[number] = [inclusion.size, inclusion.depth, *away, slab.thickness_mm, slab.modulus_kPa, s]
+    inputs, n, ratios = features(plan, points), len(specimens), len(plan.ratios)
     linear = inputs[:, :-1]
-    rise = along @ (
-        emulator.rise(linear).reshape(len(along), -1)
-        + emulator.finer(linear[:, CENTRED]).reshape(len(along), -1)
+    rise = emulator.rise(linear).reshape(n, ratios, -1) + emulator.finer(linear[:, CENTRED]).reshape(
+        n, ratios, -1
     )
-    parts = [
-        _on_grid(
-            geometry,
-            plan.resolution,
-            emulator.x,
-            rise,
-            along @ emulator.tared(linear).reshape(len(along), -1),
-        )
-    ]
+    tared = emulator.tared(linear).reshape(n, ratios, -1)
+    more: Sequence[tuple[Floats, Floats] | None] = [None] * n
     if emulator.rise_more is not None and emulator.tared_more is not None:
-        more = (r(inputs).reshape(len(level) - 1, -1) for r in (emulator.rise_more, emulator.tared_more))
-        parts.append(_on_grid(geometry, plan.coarse, emulator.x, *(level[1:] @ m for m in more)))
-    scales = amplitudes(point, s)
-    rise, tared = (scale * sum(part) for scale, part in zip(scales, zip(*parts, strict=True), strict=True))
-    return unfold(rise, tared, (x, y))
+        beyond, ends = (emulator.rise_more, emulator.tared_more), len(plan.levels) - 1
+        both = (regression(inputs).reshape(n, ends, -1) for regression in beyond)
+        more = list(zip(*both, strict=True))
+    return [_Learned(*parts) for parts in zip(points, rise, tared, more, strict=True)]
 
 
-def _on_grid(
-    geometry: Geometry, res: Resolution, x: Floats, rise: Floats, tared: Floats
-) -> tuple[Floats, Floats]:
-    """Carry fields from a mesh's nodes, flat, to the grid, (m, m) and (m, m, 3)."""
-    onto = resample(geometry, res, x)
+def signals(
+    emulator: Emulator, slab: Slab, inclusion: Inclusion, levels: Sequence[Floats]
+) -> list[tuple[Floats, Floats]]:
+    """Rise (m, m) and tared displacement per mm (m, m, 3) on the grid, for weights (l,) of levels each."""
+    return _signals(emulator, slab, inclusion, levels, _learned(emulator, [(slab, inclusion)])[0])
+
+
+def _signals(
+    emulator: Emulator, slab: Slab, inclusion: Inclusion, levels: Sequence[Floats], learned: _Learned
+) -> list[tuple[Floats, Floats]]:
+    plan, (x, y) = emulator.plan, inclusion.offset
+    big, small, s = learned.point[2], learned.point[3], float(learned.point[-1])
+    geometry = Geometry(plan.probe, slab, replace(inclusion, offset=(float(big), float(small))))
+    along = lagrange(contrast(plan.ratios), s)
+    onto = resample(geometry, plan.resolution, emulator.x)
+    first = _on_grid(onto, along @ learned.rise, along @ learned.tared)
+    if learned.more is not None:
+        onto = resample(geometry, plan.coarse, emulator.x)
+    scales, found = amplitudes(learned.point, s), []
+    for level in levels:
+        parts = [first]
+        if learned.more is not None:
+            parts.append(_on_grid(onto, *(level[1:] @ more for more in learned.more)))
+        whole = (sum(part) for part in zip(*parts, strict=True))
+        rise, tared = (scale * part for scale, part in zip(scales, whole, strict=True))
+        found.append(unfold(rise, tared, (x, y)))
+    return found
+
+
+def _on_grid(onto: tuple[Floats, Floats], rise: Floats, tared: Floats) -> tuple[Floats, Floats]:
+    """Carry fields from a mesh's nodes, flat, to the grid, (m, m) and (m, m, 3); see `resample`."""
     n = onto[0].shape[1]
     each = tared.reshape(n, n, 3).transpose(2, 0, 1)
     return onto[0] @ rise.reshape(n, n) @ onto[1].T, np.stack(

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     import pyvista as pv
 
     from .gather import Sight
+    from .traced import TracedLight
     from .transport import Light
 
 Array = NDArray[np.float64]
@@ -101,7 +102,7 @@ class Renderer:
         seed: int = 0,
         samples: int | None = None,
         noise: float | None = None,
-        traced: tuple[Array, ...] | None = None,
+        traced: tuple[Array | TracedLight, ...] | None = None,
         progress: Callable[[float], None] | None = None,
     ) -> Rendering:
         """Return the radiance picture of a pressed contact surface.
@@ -125,7 +126,8 @@ class Renderer:
             `Rendering.traced` of a press like this one, of the same sensor: nothing is traced then, only the
             gathered light, the contact, the tissue and the camera's view are computed anew. No noise of its
             own, so that differences of pictures are smooth, and up to 6 % off where LEDs shine in from air
-            (`tests/test_forward.py`), 10 % where they are embedded.
+            (`tests/test_forward.py`), 10 % where they are embedded. Or light that was learned from many
+            presses (`traced.TracedLight`), which follows the press.
         progress
             Called with the finished share, 0 to 1.
         """
@@ -143,9 +145,10 @@ class Renderer:
         each = max(_PATHS_PER_PASS // len(self.sensor.leds), 1)
         passes = max(_LEAST_PASSES, -(-samples // each))
         lights: list[Light] = []
+        walked: list[Array] = []
         if traced is not None:
             self._check_leds(shape)
-            pictures, passes, noise = self._again(shape, sight, traced[0]), 1, None
+            pictures, passes, noise = self._again(shape, sight, traced[0], walked), 1, None
         elif quality == "reference":
             pictures = self._followed(sight, -(-samples // passes), seed)
         else:
@@ -163,7 +166,7 @@ class Renderer:
             time.perf_counter() - start,
             np.mean([light.sinks for light in lights], axis=0) if lights else None,
             np.mean([light.trapped for light in lights], axis=0) if lights else None,
-            (np.mean([light.traced for light in lights], axis=0),) if lights else traced,
+            (np.mean([light.traced for light in lights], axis=0),) if lights else tuple(walked) or None,
         )
 
     def _check_leds(self, shape: surface.OpticalSurface) -> None:
@@ -192,15 +195,19 @@ class Renderer:
             yield gather.picture(sight, light.upward)
 
     def _again(
-        self, shape: surface.OpticalSurface, sight: Sight, traced: Array
+        self, shape: surface.OpticalSurface, sight: Sight, traced: Array | TracedLight, walked: list[Array]
     ) -> Iterator[NDArray[np.floating]]:
-        """The one picture (n_led, rows, columns) with light that was traced before."""
+        """The one picture (n_led, rows, columns) with light that was traced before; `walked` takes it."""
         from . import direct, gather, transport
 
         straight = direct.direct(self.sensor, self.basis, shape)
         ground = transport.survey(self.scene, self.sensor)
         with threadpool_limits(1):
-            upward = transport.again(self.sensor, self.basis, self.behind, ground, straight, traced)
+            light = (
+                traced if isinstance(traced, np.ndarray) else traced.at(self.sensor, shape, ground.fraction)
+            )
+            upward = transport.again(self.sensor, self.basis, self.behind, ground, straight, light)
+        walked.append(light)
         yield gather.picture(sight, upward)
 
     def _followed(self, sight: Sight, samples: int, seed: int) -> Iterator[NDArray[np.floating]]:

@@ -19,6 +19,8 @@ from .spectrum import Band, bands
 if TYPE_CHECKING:
     import pyvista as pv
 
+    from .traced import TracedLight
+
 _SEEDS = 2**26  # as many as a renderer keeps apart
 _SEED_STEP = 0x9E3779B1  # bands far apart, whichever number the caller chose
 
@@ -46,16 +48,9 @@ class SpectralRenderer:
             The sensor at another wavelength, nm; without it the indices stay the same.
         """
         self.sensor, self._device = sensor, device
-        self.bands = bands(sensor.leds, sensor.camera, sensor.wavelength_nm, count)
-        self._leds = [_alight(sensor, band) for band in self.bands]
-        self.renderers = []
-        for band, leds in zip(self.bands, self._leds, strict=True):
-            same = band.wavelength_nm == sensor.wavelength_nm
-            there = at(band.wavelength_nm) if at and not same else sensor
-            chosen = tuple(_as_line(there.leds[number], number in band.lit) for number in leds)
-            self.renderers.append(
-                Renderer(replace(there, leds=chosen, wavelength_nm=band.wavelength_nm), device=device)
-            )
+        parts = band_sensors(sensor, count=count, at=at)
+        self.bands, self._leds = [band for band, _, _ in parts], [leds for _, leds, _ in parts]
+        self.renderers = [Renderer(one, device=device) for _, _, one in parts]
 
     @cached_property
     def whole(self) -> Renderer:
@@ -70,7 +65,7 @@ class SpectralRenderer:
         quality: Quality = "standard",
         seed: int = 0,
         samples: int | None = None,
-        traced: tuple[NDArray[np.float64], ...] | None = None,
+        traced: tuple[NDArray[np.float64] | TracedLight, ...] | None = None,
         progress: Callable[[float], None] | None = None,
         **options: Any,
     ) -> Rendering:
@@ -132,6 +127,21 @@ class SpectralRenderer:
             traced=tuple(walked) or None,
             seconds=time.perf_counter() - start,
         )
+
+
+def band_sensors(
+    sensor: Sensor, *, count: int = 3, at: Callable[[float], Sensor] | None = None
+) -> list[tuple[Band, tuple[int, ...], Sensor]]:
+    """Return each band, the numbers of its LEDs, and the sensor as it is there; arguments as of
+    `SpectralRenderer`."""
+    found = []
+    for band in bands(sensor.leds, sensor.camera, sensor.wavelength_nm, count):
+        leds = _alight(sensor, band)
+        same = band.wavelength_nm == sensor.wavelength_nm
+        there = at(band.wavelength_nm) if at and not same else sensor
+        chosen = tuple(_as_line(there.leds[number], number in band.lit) for number in leds)
+        found.append((band, leds, replace(there, leds=chosen, wavelength_nm=band.wavelength_nm)))
+    return found
 
 
 def _mean(radiance: NDArray[np.float64]) -> float:

@@ -12,7 +12,7 @@ from numpy.lib.format import write_array
 
 import fem
 from fem.emulating import build_emulator, fit
-from fem.emulator import Emulator, lagrange, resample, signal, unfold
+from fem.emulator import Emulator, lagrange, resample, signals, unfold
 from fem.emulator_file import NotAnEmulator, load_emulator, save_emulator
 from fem.emulator_limits import check
 from fem.regression import Regression, regress
@@ -92,7 +92,7 @@ def test_held_out_solves_are_met(emulator: Emulator) -> None:
         geometry = geometry_at(PLAN, point, float(PLAN.ratios[1] * point[5]))
         assert geometry.inclusion is not None
         coarse = replace(emulator, finer=silent(emulator.finer))
-        guess, _ = signal(coarse, geometry.slab, geometry.inclusion, np.ones(1))
+        guess, _ = signals(coarse, geometry.slab, geometry.inclusion, [np.ones(1)])[0]
         onto = resample(geometry, PLAN.resolution, emulator.x)
         unit = np.tensordot(
             lagrange(tissue, np.log(point[5])),

@@ -10,7 +10,7 @@ from test_fem_emulator import COARSE, INCLUSION, PLAN, PROBE, RANGES, SLAB, grid
 
 import fem
 from fem.emulating import build_emulator
-from fem.emulator import Emulator, lagrange, resample, signal
+from fem.emulator import Emulator, lagrange, resample, signals
 from fem.emulator_file import NotAnEmulator, load_emulator, save_emulator
 from fem.mesh import Geometry
 from fem.pressing import _presses
@@ -85,7 +85,7 @@ def test_presses_between_the_levels_are_met(emulator: Emulator) -> None:
         onto = resample(geometry, COARSE, emulator.x)
         (linear,) = presses(geometry, [1.0], "linear")
         for level, press in zip((0.7, 2.4), presses(geometry, [0.7, 2.4], "finite"), strict=True):
-            guess = signal(lean, geometry.slab, geometry.inclusion, lagrange(FINITE.levels, level))[0]
+            guess = signals(lean, geometry.slab, geometry.inclusion, [lagrange(FINITE.levels, level)])[0][0]
             # so few cells cannot interpolate the singular pressure itself, but what it rises by
             rise = (press["pressure"] - press["pressure_0"]) / (level * linear["pressure_0"])
             true = onto[0] @ rise @ onto[1].T

@@ -72,8 +72,12 @@ Learn the contact field of a design's sensor, so that a press takes milliseconds
 around the design's, fit, and say how far held-out ones are off. What was solved is kept in FILE.npz.samples:
 the same command goes on with it, also after Ctrl-C.
 
+With --light, what is learned is light that has walked far through the guide, as a function of the press. It
+carries nearly all noise of Monte Carlo; pictures that take it (`twin corpus plan --traced`) have none.
+
 examples:
   twin emulate tsis --minutes 30 --out emulators/tsis.npz
+  twin emulate tsis --light --out emulators/tsis.light.npz
   twin emulate my-sensor.toml --samples 400 --workers 2 --out mine.npz
 """
 
@@ -166,6 +170,12 @@ def _parser() -> Parser:
         "--minutes", type=number(above=0.0), metavar="MIN", help="time to solve for (default 30)"
     )
     emulate.add_argument("--samples", type=whole, metavar="N", help="stop at so many samples")
+    emulate.add_argument(
+        "--light", action="store_true", help="learn the traced light of presses instead (15 core minutes)"
+    )
+    emulate.add_argument(
+        "--emulator", metavar="FILE.npz", help="with --light: of the mechanics (default emulators/DESIGN.npz)"
+    )
     emulate.add_argument("--workers", type=whole, metavar="N", help="processes (default: all cores)")
     emulate.add_argument("--seed", type=whole, default=0, metavar="N", help="of the samples (default 0)")
     emulate.add_argument("--out", metavar="FILE.npz", help="the file to write")

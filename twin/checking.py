@@ -15,7 +15,7 @@ from scenes import exr
 from twin import index, store
 from twin.complaint import shown
 from twin.occupied import LOCK, leftovers
-from twin.planned import EMULATOR, IES, PLAN, SAMPLES
+from twin.planned import EMULATOR, IES, PLAN, SAMPLES, TRACED
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from twin.plan import Plan
 
 # What others keep in a corpus's folder, and who knows: the reader's cache, the dataset card.
-_TOLERATED = frozenset({PLAN, SAMPLES, EMULATOR, LOCK, index.FILE, "README.md"})
+_TOLERATED = frozenset({PLAN, SAMPLES, EMULATOR, TRACED, LOCK, index.FILE, "README.md"})
 _FOLDERS = frozenset({"samples", "references", "failed", "cache", "figures"})
 _LARGEST = 2**32  # bytes of a picture that is looked into
 _THOUSAND = re.compile(r"[0-9]{3,9}")

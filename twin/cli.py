@@ -253,6 +253,11 @@ def _emulate(arguments: argparse.Namespace) -> None:
         if getattr(arguments, flag) == 0:
             raise DesignError(f"--{flag}", "0", "an integer > 0")
     design = load_design(arguments.design).pressed(mechanics=arguments.mechanics)
+    if arguments.light:
+        _learn_light(arguments, design)
+        return
+    if arguments.emulator is not None:
+        raise DesignError("--emulator", "it without --light", "it with --light only")
     with Reporter() as report:
         built = emulate(
             design,
@@ -264,6 +269,25 @@ def _emulate(arguments: argparse.Namespace) -> None:
             progress=lambda stage, done: report("solves" if stage[-1].isdigit() else stage, done),
         )
     print(summary(built, arguments.out))
+
+
+def _learn_light(arguments: argparse.Namespace, design: Design) -> None:
+    from twin import learn_light
+    from twin.reporting import Reporter
+
+    if arguments.minutes is not None:
+        raise DesignError("--minutes", "it with --light", "--samples")
+    with Reporter() as report:
+        light = learn_light.learn_light(
+            design,
+            arguments.out,
+            emulator=arguments.emulator,
+            samples=arguments.samples or learn_light.PRESSES,
+            workers=arguments.workers or os.cpu_count() or 1,
+            seed=arguments.seed,
+            progress=report,
+        )
+    print(learn_light.summary(light, arguments.out))
 
 
 def _pressed(arguments: argparse.Namespace) -> Design:

@@ -102,6 +102,9 @@ def _add_plan(actions: Any) -> None:
         help=", ".join((*MECHANICS, "emulator")) + " (default: the study's)",
     )
     plan.add_argument("--emulator", metavar="FILE.npz", help="for emulator (default emulators/DESIGN.npz)")
+    plan.add_argument(
+        "--traced", metavar="FILE.npz", help="traced light without noise, of `twin emulate DESIGN --light`"
+    )
     for flag, of in (("--quality", "the mechanics"), ("--light", "the light")):
         words = f"{', '.join(QUALITIES)}: of {of} (default: the study's)"
         plan.add_argument(flag, type=choice(*QUALITIES), metavar="Q", help=words)

@@ -30,6 +30,7 @@ def _plan(arguments: argparse.Namespace) -> int:
             seed=arguments.seed,
             mechanics=arguments.mechanics,
             emulator=arguments.emulator,
+            traced=arguments.traced,
             quality=arguments.quality,
             light=arguments.light,
             count=arguments.count,

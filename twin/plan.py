@@ -11,7 +11,7 @@ import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from twin.planned import (
     IES,
     PLAN,
     SAMPLES,
+    TRACED,
     Plan,
     design_sha256,
     load_plan,
@@ -37,6 +38,9 @@ from twin.sample_table import MAX_NUMBERS, write_samples
 from twin.settling import Columns, Drawn, Setting, drawn
 from twin.stage import staged
 from twin.study import MAX_COUNT, PARAMETERS, CorpusMechanics, Distribution, Source, load_study
+
+if TYPE_CHECKING:
+    from scenes.traced import TracedLight
 
 __all__ = ["Plan", "freeze", "load_plan"]
 
@@ -50,6 +54,7 @@ def freeze(
     seed: int | None = None,
     mechanics: CorpusMechanics | None = None,
     emulator: str | Path | None = None,
+    traced: str | Path | None = None,
     quality: presses.Quality | None = None,
     light: presses.Quality | None = None,
     count: int | None = None,
@@ -72,10 +77,18 @@ def freeze(
     design = _design(source)
     mechanics = mechanics or settings.mechanics or design.mechanics
     file = _emulator_file(source, design, mechanics, emulator)
+    light_file = Path(traced) if traced is not None else None
+    if light_file is None and settings.traced is not None:
+        light_file = source.folder / settings.traced
     try:
         if mechanics != "emulator":
             design = design.pressed(mechanics=mechanics)
-        setting = _setting(source, design, settings.seed if seed is None else seed, file)
+        lit = light or settings.light or quality or settings.quality
+        if light_file is not None and lit == "reference":
+            raise DesignError(
+                "traced", "it with light = 'reference'", "it with 'preview' or 'standard' light"
+            )
+        setting = _setting(source, design, settings.seed if seed is None else seed, file, light_file)
     except DesignError as error:
         field = re.sub(r"^press\.(indentation_mm)", r"\1", error.field)
         raise error.renamed(field, source=error.source or source.name) from None
@@ -107,10 +120,10 @@ def freeze(
             "format": FORMAT,
             "name": settings.name,
             "description": settings.description,
-            **_carried(setting, folder, file),
+            **_carried(setting, folder, file, light_file),
             "seed": setting.seed,
             "quality": quality or settings.quality,
-            "light": light or settings.light or quality or settings.quality,
+            "light": lit,
             "mechanics": mechanics,
             "indentation_mm": list(settings.indentation_mm),
             "light_seed": settings.light_seed,
@@ -131,7 +144,7 @@ def holds_plan(folder: Path) -> bool:
     """Return whether a folder holds a plan that nothing was run of, and nothing else."""
     names = {entry.name for entry in folder.iterdir()}
     rest = {name for name in names if not IES.fullmatch(name)}
-    return PLAN in rest and rest <= {PLAN, SAMPLES, EMULATOR}
+    return PLAN in rest and rest <= {PLAN, SAMPLES, EMULATOR, TRACED}
 
 
 def _design(source: Source) -> Design:
@@ -154,7 +167,7 @@ def _emulator_file(
     return presses.EMULATORS / f"{design.name}.npz"
 
 
-def _setting(source: Source, design: Design, seed: int, file: Path | None) -> Setting:
+def _setting(source: Source, design: Design, seed: int, file: Path | None, traced: Path | None) -> Setting:
     """Return what all samples share, checked."""
     tables = tables_of(design)
     tables["press"]["indentation_mm"] = list(source.study.indentation_mm)
@@ -164,7 +177,17 @@ def _setting(source: Source, design: Design, seed: int, file: Path | None) -> Se
     for one in varied:
         check_bounds(f"randomise.{one.field}", one.distribution, one.base)
     emulator = None if file is None else presses.emulator_of(design, file)
-    return Setting(seed, tables, design, varied, emulator)
+    light = None if traced is None else _traced_light(traced)
+    return Setting(seed, tables, design, varied, emulator, light)
+
+
+def _traced_light(file: Path) -> tuple[TracedLight, ...]:
+    from scenes import traced
+
+    try:
+        return traced.load(file)
+    except OSError:
+        raise DesignError("traced", shown(str(file)), "a file of `twin emulate --light`") from None
 
 
 def _joined(setting: Setting, groups: Sequence[Drawn]) -> tuple[list[str], Columns]:
@@ -196,7 +219,7 @@ def _joined(setting: Setting, groups: Sequence[Drawn]) -> tuple[list[str], Colum
     return fields, columns
 
 
-def _carried(setting: Setting, folder: Path, file: Path | None) -> dict[str, Any]:
+def _carried(setting: Setting, folder: Path, file: Path | None, traced: Path | None) -> dict[str, Any]:
     """Copy the emulator and luminaire files into the corpus, and return what plan.json says of them."""
     design, ies = {**setting.tables, "leds": [dict(led) for led in setting.tables["leds"]]}, {}
     for number, led in enumerate(design["leds"]):
@@ -209,7 +232,17 @@ def _carried(setting: Setting, folder: Path, file: Path | None) -> dict[str, Any
         shutil.copyfile(file, folder / EMULATOR)
         emulator = {"file": EMULATOR, "sha256": sha256(folder / EMULATOR)}
         fem.load_emulator(folder / EMULATOR)
-    return {"design": design, "design_sha256": design_sha256(design), "emulator": emulator, "ies": ies}
+    light = None
+    if traced is not None:
+        shutil.copyfile(traced, folder / TRACED)
+        light = {"file": TRACED, "sha256": sha256(folder / TRACED)}
+    return {
+        "design": design,
+        "design_sha256": design_sha256(design),
+        "emulator": emulator,
+        "ies": ies,
+        "traced": light,
+    }
 
 
 def _said(distribution: Distribution) -> dict[str, Any]:

@@ -43,6 +43,7 @@ from twin.study import (
 PLAN = "plan.json"
 SAMPLES = "samples.parquet"
 EMULATOR = "emulator.npz"
+TRACED = "traced.npz"
 FORMAT = 1
 
 _MAX_BYTES = 64 * 2**20  # of plan.json
@@ -54,6 +55,12 @@ Sha = Annotated[str, Field(min_length=64, max_length=64, pattern=r"^[0-9a-f]{64}
 @dataclass(frozen=True, config=CONFIG)
 class EmulatorFile:
     file: Literal["emulator.npz"]
+    sha256: Sha
+
+
+@dataclass(frozen=True, config=CONFIG)
+class TracedFile:
+    file: Literal["traced.npz"]
     sha256: Sha
 
 
@@ -100,6 +107,7 @@ class Head:
     versions: dict[str, Annotated[str, Field(max_length=100)]]
     study: Annotated[str, Field(max_length=MAX_TEXT)]
     ies: Annotated[dict[str, Sha], Field(max_length=64)] = Field(default_factory=dict)
+    traced: TracedFile | None = None
 
 
 _HEAD = TypeAdapter(Head)
@@ -154,6 +162,11 @@ class Plan:
     def emulator(self) -> Path | None:
         """The emulator's file, where mechanics are "emulator"."""
         return self.folder / EMULATOR if self.head.emulator else None
+
+    @property
+    def traced(self) -> Path | None:
+        """The file of learned traced light, where pictures take it."""
+        return self.folder / TRACED if self.head.traced else None
 
     @property
     def indentation_mm(self) -> tuple[float, ...]:
@@ -353,6 +366,8 @@ def _check_files(place: Path, head: Head) -> None:
         raise DesignError("emulator", shown(head.emulator), 'a file with mechanics = "emulator" only')
     if head.emulator is not None:
         named[EMULATOR] = head.emulator.sha256
+    if head.traced is not None:
+        named[TRACED] = head.traced.sha256
     leds = head.design.get("leds")
     said = [led.get("ies") for led in leds if isinstance(led, dict)] if isinstance(leds, list) else []
     for name in [*head.ies, *(name for name in said if name is not None)]:

@@ -17,7 +17,7 @@ from twin import store
 from twin.checking import Problem
 from twin.complaint import shown
 from twin.frame import versions
-from twin.planned import EMULATOR, IES, PLAN, SAMPLES
+from twin.planned import EMULATOR, IES, PLAN, SAMPLES, TRACED
 
 if TYPE_CHECKING:
     from twin.plan import Plan
@@ -36,7 +36,7 @@ def remade(folder: Path, plan: Plan, numbers: Sequence[int], workers: int | None
     with tempfile.TemporaryDirectory(prefix="twin-verify-") as scratch:
         again = Path(scratch)
         for path in folder.iterdir():
-            if path.name in (PLAN, SAMPLES, EMULATOR) or IES.fullmatch(path.name):
+            if path.name in (PLAN, SAMPLES, EMULATOR, TRACED) or IES.fullmatch(path.name):
                 shutil.copyfile(path, again / path.name)
         run(again, workers, numbers=numbers)
         return [problem for number in numbers for problem in _compared(folder, again, plan, number)]

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from fem import Emulator
     from scenes import Rendering, SpectralRenderer
     from scenes.sensor import Sensor
+    from scenes.traced import TracedLight
     from twin.plan import Plan
 
 
@@ -83,7 +84,7 @@ def lit(plan: Plan, number: int, contacts: list[Contact], seconds: float, corpus
         hashes: dict[str, str] = {}
         for level, contact in enumerate(contacts):
             plain = plan.inclusion(number) is None
-            rendering = _render(design, contact, "pressure_0" if plain else "pressure", plan.light, light)
+            rendering = _render(plan, design, contact, "pressure_0" if plain else "pressure", light)
             same = rendering if plain else None
             reference = _reference(plan, number, level, contact, corpus, folder, same)
             began = time.perf_counter()
@@ -154,7 +155,7 @@ def _reference(
     else:
         folder_name = store.sample_folder(corpus, number).relative_to(corpus)
         name, place, seed = f"{folder_name}/{level}.reference", folder / f"{level}.reference", camera
-    rendering = same or _render(design, contact, "pressure_0", plan.light, light)
+    rendering = same or _render(plan, design, contact, "pressure_0", light)
     counts = take_reference(design, rendering.radiance, seed, contact.level_mm)
     record = {
         "press": {"nominal_mm": plan.indentation_mm[level], "indentation_mm": contact.level_mm},
@@ -198,6 +199,8 @@ def _key(plan: Plan, contact: Contact, light: int) -> str:
     head = plan.head  # its design, not that of the sample, which knows where the corpus lies
     told.update(repr((head.design_sha256, sorted(head.ies.items()))).encode())
     told.update(repr((plan.light, light, contact.level_mm)).encode())
+    if head.traced is not None:
+        told.update(head.traced.sha256.encode())
     for array in (contact.surface.points, contact.surface["pressure_0"], contact.surface["displacement_0"]):
         told.update(np.ascontiguousarray(array, np.float64).tobytes())
     return told.hexdigest()[:16]
@@ -219,9 +222,12 @@ def _write(
     exr.write_png(place.with_name(place.name + ".png"), whole)
 
 
-def _render(design: Design, contact: Contact, field: str, quality: Any, seed: int) -> Rendering:
+def _render(plan: Plan, design: Design, contact: Contact, field: str, seed: int) -> Rendering:
     renderer = _renderer(design)
-    return renderer.render(contact.surface, field=field, quality=quality, seed=light_seed(seed))
+    traced = None if plan.traced is None else _traced(str(plan.traced))
+    return renderer.render(
+        contact.surface, field=field, quality=plan.light, seed=light_seed(seed), traced=traced
+    )
 
 
 _KEPT: dict[Sensor, SpectralRenderer] = {}
@@ -236,6 +242,13 @@ def _renderer(design: Design) -> SpectralRenderer:
         _KEPT.clear()
         _KEPT[sensor] = SpectralRenderer(sensor, count=design.light.bands, at=design.sensor, device="cpu")
     return _KEPT[sensor]
+
+
+@lru_cache(maxsize=1)
+def _traced(file: str) -> tuple[TracedLight, ...]:
+    from scenes import traced
+
+    return traced.load(file)
 
 
 @lru_cache(maxsize=1)

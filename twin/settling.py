@@ -23,6 +23,7 @@ from twin.tables import read_grid, read_table
 
 if TYPE_CHECKING:
     from fem import Emulator
+    from scenes.traced import TracedLight
 
 Columns = dict[str, NDArray[Any]]
 
@@ -43,6 +44,7 @@ class Setting:
     design: Design
     varied: tuple[Varied, ...]
     emulator: Emulator | None
+    traced: tuple[TracedLight, ...] | None = None
 
     def check(self, columns: Columns, number: int) -> None:
         """Raise ValueError, in one line, if a sample cannot be simulated."""
@@ -56,6 +58,11 @@ class Setting:
         presses.check(design, inclusion, levels)
         if self.emulator is not None:
             presses.check_emulated(design, inclusion, levels, self.emulator)
+        if self.traced is not None:
+            from scenes import spectral, traced
+
+            parts = spectral.band_sensors(design.sensor(), count=design.light.bands, at=design.sensor)
+            traced.check(self.traced, [sensor for _, _, sensor in parts])
 
 
 @dataclass(frozen=True)

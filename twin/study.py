@@ -121,6 +121,7 @@ class Study:
     light: Quality | None = None
     mechanics: CorpusMechanics | None = None
     emulator: FileName | None = None
+    traced: FileName | None = None
     indentation_mm: Annotated[tuple[Depth, ...], Field(min_length=1, max_length=100)] = (1.0, 2.0, 3.0)
     light_seed: LightSeed = "shared"
     randomise: Randomise = Field(default_factory=dict)

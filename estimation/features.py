@@ -1,0 +1,82 @@
+"""Pictures in few numbers: principal components of coarse pictures over the camera's noise.
+
+A specimen is seen at several press levels, each with its reference. What is compressed is the tared picture
+and the reference, so that absolute brightness is kept; both are divided by the noise of a mean picture, so
+that components are ordered by what can be seen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Single = NDArray[np.float32]
+
+_SEEN = 0.05
+"""Least variance of a component that is kept, over the noise of a single exposure."""
+
+
+@dataclass(frozen=True)
+class Features:
+    """Projection of pictures (n, levels, 2, r, c), each with its reference behind it, onto k numbers.
+
+    Attributes
+    ----------
+    mean : (m,) of the stacked and whitened pictures, m = levels * 2 * r * c.
+    axes : (k, m).
+    noise : (levels, 2) counts, standard deviation of tared picture and reference in a block of pixels.
+    spread : (k,) standard deviation of the features over specimens, in those of the noise.
+    shape : (levels, 2, r, c).
+    """
+
+    mean: Single
+    axes: Single
+    noise: Single
+    spread: Single
+    shape: tuple[int, int, int, int]
+
+    def __call__(self, pictures: NDArray[np.floating]) -> Single:
+        """Features (n, k) of pictures (n, levels, 2, r, c), counts."""
+        return np.asarray((self.stacked(pictures) - self.mean) @ self.axes.T, np.float32)
+
+    def stacked(self, pictures: NDArray[np.floating]) -> Single:
+        """Tared pictures and references over the noise, (n, m)."""
+        given = np.asarray(pictures, np.float32)
+        tared = np.stack([given[:, :, 0] - given[:, :, 1], given[:, :, 1]], axis=2)
+        return np.asarray((tared / self.noise[:, :, None, None]).reshape(len(given), -1), np.float32)
+
+    @property
+    def onto(self) -> Single:
+        """(levels, 2, r * c, k): what each block's counts of picture and reference add to the features."""
+        levels, _, rows, columns = self.shape
+        axes = self.axes.reshape(-1, levels, 2, rows * columns) / self.noise[:, :, None]
+        tared, reference = axes[:, :, 0], axes[:, :, 1]
+        return np.ascontiguousarray(
+            np.stack([tared, reference - tared], axis=2).transpose(1, 2, 3, 0), np.float32
+        )
+
+
+def compress(pictures: NDArray[np.floating], noise: NDArray[np.floating], *, most: int = 96) -> Features:
+    """Find the components of pictures (n, levels, 2, r, c) without noise.
+
+    ``noise`` is (levels, 2), of tared picture and reference, counts. Components of which less is seen than
+    `_SEEN` of one exposure's noise are left out, and all beyond ``most``.
+    """
+    first = Features(
+        np.zeros(1, np.float32),
+        np.zeros((1, 1), np.float32),
+        np.asarray(noise, np.float32),
+        np.zeros(1, np.float32),
+        tuple(pictures.shape[1:]),
+    )
+    x = first.stacked(pictures)
+    mean = x.mean(axis=0)
+    x -= mean
+    values, vectors = np.linalg.eigh((x @ x.T).astype(np.float64))
+    order = np.argsort(values)[::-1][:most]
+    spread = np.sqrt(np.maximum(values[order], 0.0) / len(x))
+    keep = order[spread**2 > _SEEN]
+    axes = (vectors[:, keep].T / np.sqrt(values[keep])[:, None]).astype(np.float32) @ x
+    return Features(mean, axes, first.noise, spread[: len(keep)].astype(np.float32), first.shape)

@@ -1,0 +1,253 @@
+"""Traced light of any press of one sensor, learned from the traced light of many presses.
+
+Light that is not gathered has walked far through the guide and carries nearly all of the Monte Carlo noise,
+which is far above the camera's (`tests/test_traced.py`). It changes little and smoothly from press to press:
+here its maps are a mean plus a few modes, whose amounts are a quadratic of the leading principal components
+of real contact fraction and displacement (reduced-rank regression: Izenman 1975; [izenman1975]). A picture
+that takes it (`Renderer.render(traced=...)`) has no noise of its own and is the same function of the press
+every time, so that pictures can be compared and differentiated.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .sensor import NotModelled, Sensor
+from .surface import OpticalSurface
+
+Array = NDArray[np.float64]
+Single = NDArray[np.float32]
+
+_INPUTS, _CURVED = 10, 4  # principal components, and how many of them go in with squares and products
+_MODES = 10
+_COARSE = 50  # cells per side on which modes are kept
+_FINE = 100  # on which their mean is
+_BEYOND = 2.0  # how far inputs may leave what was learned, times its reach
+FORMAT = "tsis-traced-1"
+
+
+@dataclass(frozen=True)
+class TracedLight:
+    """Weighted irradiance on the contact surface per watt of each LED, as a function of the contact.
+
+    Attributes
+    ----------
+    key : of the sensor's optics (`optics_key`); light of another is refused.
+    centre, axes : (d,) and (d, inputs); inputs of a press are (its description - centre) @ axes.
+    reach : (inputs,) largest magnitude learned.
+    weights : (terms, modes) amounts of the modes.
+    mean : (n_led, layers, m, m), 1/mm².
+    modes : (modes, n_led, layers, 50, 50), 1/mm².
+    presses : how many were learned.
+    error_percent : root mean square over the presses, each left out in turn, of the error of all traced light
+        together, in per cent of it; the noise of what was traced is in it.
+    """
+
+    key: str
+    centre: Array
+    axes: Array
+    reach: Array
+    weights: Array
+    mean: Single
+    modes: Single
+    presses: int
+    error_percent: float
+
+    def at(self, sensor: Sensor, shape: OpticalSurface, fraction: Array) -> Array:
+        """Return the traced light of a press, (n_led, layers, g, g) W/mm².
+
+        Parameters
+        ----------
+        fraction : (g, g) real contact fraction on the cells of the maps, `transport.Ground.fraction`.
+
+        Raises
+        ------
+        NotModelled
+            For another sensor, and for presses far from those that were learned.
+        """
+        if optics_key(sensor) != self.key:
+            raise NotModelled("traced: received light learned of another sensor; allowed this sensor's own")
+        inputs = (describe(shape, fraction) - self.centre) @ self.axes
+        far = float(np.max(np.abs(inputs) / self.reach))
+        if far > _BEYOND:
+            raise NotModelled(
+                f"traced: received a press {far:.2g} times as far out as those learned; allowed {_BEYOND:g}"
+            )
+        amounts = _terms(inputs[None])[0] @ self.weights
+        found = _enlarged(self.mean, fraction.shape[0])
+        found += _enlarged(np.tensordot(amounts, self.modes, 1), fraction.shape[0])
+        flux = np.array([led.flux_W for led in sensor.leds])
+        return np.asarray(flux[:, None, None, None] * found)
+
+
+def optics_key(sensor: Sensor) -> str:
+    """Return a hash of all that traced light depends on, but for the press: not the camera, the LEDs' power
+    and what the contact fraction says."""
+    leds = tuple(replace(led, flux_W=1.0) for led in sensor.leds)
+    skin = replace(sensor.skin, rms_slope=1.0, kappa=1.0)
+    told = (sensor.guide, sensor.glass, leds, skin, sensor.tissue, sensor.wavelength_nm)
+    return hashlib.sha256(repr(told).encode()).hexdigest()[:16]
+
+
+def check(light: Sequence[TracedLight], sensors: Sequence[Sensor]) -> None:
+    """Raise `NotModelled` if light was not learned of these sensors, one for each band."""
+    if [one.key for one in light] != [optics_key(sensor) for sensor in sensors]:
+        raise NotModelled(
+            "traced: received light learned of another sensor; allowed this one's (LED power, camera and "
+            "rms_slope are free)"
+        )
+
+
+def describe(shape: OpticalSurface, fraction: Array) -> Array:
+    """Return what a press looks like, (d,): contact fraction on 50 x 50 cells, displacement in mm on a coarse
+    grid."""
+    step = max((len(shape.nodes_mm) - 1) // 32, 1)
+    moved = shape.displacement_mm[::step, ::step]
+    return np.concatenate([_coarse(np.asarray(fraction)).ravel(), moved.ravel()])
+
+
+def learn(
+    sensor: Sensor,
+    descriptions: Sequence[NDArray[np.floating]],
+    traced: Sequence[NDArray[np.floating]],
+) -> TracedLight:
+    """Learn from presses of one sensor.
+
+    Parameters
+    ----------
+    descriptions : (n, d) from `describe`.
+    traced : n maps (n_led, layers, g, g), W/mm², `Rendering.traced` of one band.
+    """
+    n = len(traced)
+    terms = _terms(np.zeros((1, _INPUTS))).shape[1]
+    if n < 2 * terms or len(descriptions) != n:
+        raise ValueError(f"traced: received {n} maps; allowed {2 * terms} or more, one for each description")
+    x = np.asarray(descriptions, np.float64)
+    centre = x.mean(axis=0)
+    x = x - centre
+    cells = _COARSE**2
+    scale = np.concatenate(
+        [np.full(cells, x[:, :cells].std()), np.full(x.shape[1] - cells, x[:, cells:].std())]
+    )
+    _, size, axes = np.linalg.svd(x / scale, full_matrices=False)
+    axes = axes[:_INPUTS].T / scale[:, None] * (np.sqrt(n) / size[:_INPUTS])
+    inputs = x @ axes
+    flux = np.array([led.flux_W for led in sensor.leds])[:, None, None, None]
+    fine = min(traced[0].shape[-1], _FINE)
+    mean = np.zeros((*traced[0].shape[:2], fine, fine))
+    coarse = np.empty((n, *traced[0].shape[:2], _COARSE, _COARSE), np.float32)
+    for number, maps in enumerate(traced):
+        per_watt = np.asarray(maps, np.float64) / flux
+        mean += blocks(per_watt, fine) / n
+        coarse[number] = blocks(per_watt, _COARSE)
+    flat = coarse.reshape(n, -1)
+    middle = flat.mean(axis=0)
+    a = _terms(inputs)
+    hat = a @ np.linalg.pinv(a)
+    total = flat.sum(axis=1, dtype=np.float64)
+    left_out = (total - hat @ total) / (1.0 - np.diag(hat)) / total
+    fitted = (hat @ (flat - middle)).astype(np.float32)
+    values, vectors = np.linalg.eigh(np.asarray(fitted @ fitted.T, np.float64))
+    leading = vectors[:, np.argsort(values)[::-1][:_MODES]]
+    modes = (leading.T @ fitted).reshape(-1, *coarse.shape[1:])
+    return TracedLight(
+        optics_key(sensor),
+        centre,
+        axes,
+        np.abs(inputs).max(axis=0),
+        np.linalg.pinv(a) @ leading,
+        mean.astype(np.float32),
+        modes.astype(np.float32),
+        n,
+        100.0 * float(np.sqrt(np.mean(left_out**2))),
+    )
+
+
+def save(light: Sequence[TracedLight], path: str | Path) -> None:
+    """Write the light of each band as plain arrays; see `load`."""
+    arrays: dict[str, NDArray[np.generic]] = {"format": np.array(FORMAT), "bands": np.array(len(light))}
+    for number, one in enumerate(light):
+        arrays |= {f"{number}.{name}": np.asarray(value) for name, value in vars(one).items()}
+    with open(path, "wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays)
+
+
+def load(path: str | Path) -> tuple[TracedLight, ...]:
+    """Read what `save` wrote, one for each band. Raises `NotModelled` for other files, OSError for none."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            if str(file["format"]) != FORMAT:
+                raise ValueError
+            return tuple(_one(file, number) for number in range(min(int(file["bands"]), 64)))
+    except OSError:
+        raise
+    except Exception:  # whatever a broken archive leads to
+        raise NotModelled(
+            f"{path}: received no traced light; allowed a file of `twin emulate --light`"
+        ) from None
+
+
+def _one(file: np.lib.npyio.NpzFile, number: int) -> TracedLight:
+    def part(name: str) -> Array:
+        found = file[f"{number}.{name}"]
+        if found.dtype.kind != "f" or not np.isfinite(found).all():
+            raise ValueError(name)
+        return np.asarray(found, np.float64)
+
+    centre, axes, reach, weights = (part(name) for name in ("centre", "axes", "reach", "weights"))
+    mean, modes = (part(name).astype(np.float32) for name in ("mean", "modes"))
+    k, m = axes.shape[1], len(modes)
+    fits = (
+        axes.shape == (len(centre), _INPUTS)
+        and reach.shape == (k,)
+        and (reach > 0).all()
+        and weights.shape == (_terms(np.zeros((1, k))).shape[1], m)
+        and mean.ndim == 4
+        and mean.shape[-1] == mean.shape[-2]
+        and modes.shape == (m, *mean.shape[:2], _COARSE, _COARSE)
+    )
+    if not fits:
+        raise ValueError("shapes")
+    return TracedLight(
+        str(file[f"{number}.key"]),
+        centre,
+        axes,
+        reach,
+        weights,
+        mean,
+        modes,
+        int(file[f"{number}.presses"]),
+        float(part("error_percent")),
+    )
+
+
+def _terms(inputs: Array) -> Array:
+    """One, the inputs, and squares and products of the leading ones, (n, terms)."""
+    products = [
+        inputs[:, i] * inputs[:, j] - float(i == j) for i in range(_CURVED) for j in range(i, _CURVED)
+    ]
+    return np.column_stack([np.ones(len(inputs)), inputs, *products])
+
+
+def _coarse(cells: Array) -> Array:
+    return blocks(cells, _COARSE)
+
+
+def blocks(cells: Array, to: int) -> Array:
+    """Means over blocks of cells (..., g, g), `to` blocks per side."""
+    step = cells.shape[-1] // to
+    return np.asarray(cells.reshape(*cells.shape[:-2], to, step, to, step).mean(axis=(-3, -1)))
+
+
+def _enlarged(maps: NDArray[np.floating], to: int) -> Array:
+    """Maps on `to` cells per side, linear in between."""
+    cells = maps.shape[-1]
+    middles, finer = (np.arange(cells) + 0.5) / cells, (np.arange(to) + 0.5) / to
+    step = np.stack([np.interp(finer, middles, column) for column in np.eye(cells)], axis=1)
+    return np.asarray(np.matmul(np.matmul(step, maps), step.T), np.float64)

@@ -1,0 +1,182 @@
+"""Specimens as a corpus's study would draw them, as many as one likes, by the chain instead of light."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+import fem
+from estimation.features import Features
+from estimation.posterior import Simulated
+from twin.chain import BLOCK, FIELDS, Chain, contacts
+from twin.complaint import DesignError, shown
+from twin.design import Design
+from twin.fields import expand, tables_of
+from twin.plan import Plan
+from twin.settling import Setting, drawn
+from twin.study import PARAMETERS, parse_study
+
+Single = NDArray[np.float32]
+
+WANTED = PARAMETERS[:3]
+_AT_ONCE = 64  # specimens whose contacts are worked out together
+_DRAWS = 4  # of noise for every specimen
+
+
+def specimens(plan: Plan, count: int, seed: int) -> list[dict[str, float]]:
+    """Return the values of so many specimens with an inclusion, of the first group that draws them.
+
+    Raises
+    ------
+    DesignError
+        For a corpus without such a group, or one that varies what the chain does not know.
+    """
+    study = parse_study(plan.head.study)
+    group = next((one for one in study.samples if one.inclusion is not None), None)
+    if group is None:
+        raise DesignError(
+            "samples", "tables and grids", "a group that is drawn from ranges", source=plan.name
+        )
+    tables = tables_of(plan.base)
+    varied = tuple(expand(tables, study.randomise))
+    for one in varied:
+        check_field(one.field, plan.name)
+    if plan.emulator is None:
+        raise DesignError("mechanics", shown(plan.mechanics), '"emulator"', source=plan.name)
+    setting = Setting(seed, tables, plan.base, varied, fem.load_emulator(plan.emulator))
+    many = replace(group, name="imagined", sampler="uniform", count=count, blanks=0.0)
+    columns = drawn(setting, many, Path(), "samples", None, lambda share: None).columns
+    names = [*PARAMETERS, *(one.field for one in varied)]
+    return [{name: float(columns[name][number]) for name in names} for number in range(count)]
+
+
+def check_field(field: str, source: str) -> None:
+    """Raise `DesignError` for a field that the chain does not know."""
+    parts = field.split(".")
+    known = field in FIELDS or (parts[0] == "leds" and parts[-1] == "flux_W")
+    if not known and parts[:2] != ["press", "indentation_mm"]:
+        allowed = f"{', '.join(FIELDS)}, leds.*.flux_W, press.indentation_mm"
+        raise DesignError(f"randomise.{field}", "it", allowed, source=source)
+
+
+def inputs_of(
+    chain: Chain,
+    emulator: Path,
+    values: Sequence[dict[str, float]],
+    workers: int,
+    tell: Callable[[float], None],
+) -> Single:
+    """Return the light map's inputs (n, levels, 2, k) of specimens."""
+    parts = [values[at : at + _AT_ONCE] for at in range(0, len(values), _AT_ONCE)]
+    found = []
+    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
+        jobs = pool.map(_contacts, [(chain.design, str(emulator), part) for part in parts])
+        for number, one in enumerate(jobs, start=1):
+            inputs = chain.light.inputs(one.reshape(-1, one.shape[-1]))
+            found.append(inputs.reshape(*one.shape[:3], -1))
+            tell(number / len(parts))
+    return np.concatenate(found)
+
+
+def _contacts(task: tuple[Design, str, list[dict[str, float]]]) -> Single:
+    design, emulator, values = task
+    return contacts(design, _emulator(emulator), values)
+
+
+@lru_cache(maxsize=1)
+def _emulator(file: str) -> fem.Emulator:
+    return fem.load_emulator(file)
+
+
+@dataclass(frozen=True)
+class Brightness:
+    """What multiplies the light of specimens: LED powers (n, n_led) W and gains (n,) electrons per count."""
+
+    flux_W: Single
+    gain: Single
+
+    @staticmethod
+    def of(chain: Chain, values: Sequence[dict[str, float]]) -> Brightness:
+        return Brightness(
+            np.stack([chain.fluxes(one) for one in values]),
+            np.array([chain.gain(one) for one in values], np.float32),
+        )
+
+
+def pictures(chain: Chain, inputs: Single, brightness: Brightness) -> Single:
+    """Return expected coarse counts above black, (n, levels, 2, r, c), for inputs (n, levels, 2, k)."""
+    found = np.empty((*inputs.shape[:3], *chain.shape), np.float32)
+    for rows in _slices(len(inputs), 128):
+        charges = chain.light.at(inputs[rows].reshape(-1, inputs.shape[-1]))
+        charges = charges.reshape(*inputs[rows].shape[:3], *chain.light.shape)
+        light = np.einsum("nlpiyx,ni->nlpyx", charges, brightness.flux_W[rows], optimize=True)
+        found[rows] = light / brightness.gain[rows, None, None, None, None]
+    return found
+
+
+def noise_variance(design: Design, counts: NDArray[np.floating], gain: NDArray[np.floating]) -> Single:
+    """Return the variance of one exposure of a block of pixels, counts², for counts above black.
+
+    Photons, dark charge and reading (EMVA 1288 release 4.0 linear, section 2; [emva1288]), and 1/12 for
+    rounding, over the pixels of a block.
+    """
+    camera = design.camera
+    dark_e = camera.dark_current_e_s * camera.exposure_ms * 1e-3 * camera.binning**2
+    gain = np.asarray(gain, np.float32).reshape(-1, *(1,) * (counts.ndim - 1))
+    electrons = np.maximum(counts, 0.0) * gain + camera.read_noise_e**2 + dark_e
+    return np.asarray((electrons / gain**2 + 1.0 / 12.0) / (BLOCK[0] * BLOCK[1]), np.float32)
+
+
+def simulate(
+    chain: Chain,
+    features: Features,
+    inputs: Single,
+    values: Sequence[dict[str, float]],
+    ranges: NDArray[np.floating],
+    error: Single,
+    seed: int,
+    tell: Callable[[float], None],
+) -> Simulated:
+    """Return specimens as features, with noise of their own.
+
+    Parameters
+    ----------
+    inputs : (n, levels, 2, k) of the light map.
+    ranges : (3, 2) of `WANTED`, which become 0 to 1.
+    error : (m, k) features of the light map's errors.
+    """
+    n, onto = len(inputs), features.onto
+    brightness = Brightness.of(chain, values)
+    k = len(features.spread)
+    present, absent = np.empty((n, k), np.float32), np.empty((n, k), np.float32)
+    noise, reference = (np.empty((n, _DRAWS, k), np.float32) for _ in range(2))
+    rng = np.random.default_rng([seed, 1])
+    flat = onto.reshape(-1, 2, onto.shape[2], k)
+    for rows in _slices(n, 128):
+        seen = pictures(chain, inputs[rows], Brightness(brightness.flux_W[rows], brightness.gain[rows]))
+        present[rows] = features(seen)
+        absent[rows] = features(np.stack([seen[:, :, 1], seen[:, :, 1]], axis=2))
+        spread = np.sqrt(noise_variance(chain.design, seen, brightness.gain[rows]))
+        spread = spread.reshape(*spread.shape[:3], -1)
+        for draw in range(_DRAWS):
+            for place, pool in ((0, noise), (1, reference)):
+                one = spread[:, :, place] * rng.standard_normal(spread[:, :, place].shape, np.float32)
+                pool[rows, draw] = np.einsum("nlm,lmk->nk", one, flat[:, place], optimize=True)
+        tell(rows.stop / n)
+    low, high = np.asarray(ranges, np.float64).T
+    truth = np.array([[one[name] for name in WANTED] for one in values])
+    return Simulated(
+        ((truth - low) / (high - low)).astype(np.float32), present, absent, noise, reference, error
+    )
+
+
+def _slices(n: int, step: int) -> Iterator[slice]:
+    for start in range(0, n, step):
+        yield slice(start, min(start + step, n))

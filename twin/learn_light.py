@@ -1,0 +1,220 @@
+"""`twin emulate --light`: learn the traced light of a sensor, so that pictures have no noise of the light.
+
+Presses of many specimens around the design's are traced, one file each in the folder OUT + ".presses": the
+same call goes on with them. What is learned is `scenes.traced.TracedLight`.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import qmc
+
+import fem
+from twin import presses
+from twin.complaint import DesignError, shown
+from twin.design import Design, parse_design
+from twin.fields import put, tables_of
+from twin.stage import check_file, staged_file
+
+if TYPE_CHECKING:
+    from scenes.traced import TracedLight
+
+PRESSES = 256
+"""Presses that are traced; every fourth without its inclusion, too."""
+_BLANK_EVERY = 4
+_CELLS = 100  # of the maps that are kept, per side
+_NUISANCE = {"specimen.modulus_kPa": 0.15, "specimen.thickness_mm": 0.1, "surface.rms_slope": 0.35}
+"""What else differs from press to press: up to so much of its value either way."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """One press to trace, as a worker process takes it."""
+
+    design: Design
+    inclusion: fem.Inclusion
+    depth_mm: float
+    emulator: str
+    seed: int
+    blank: bool
+    place: Path
+
+
+def learn_light(
+    design: Design,
+    out: str,
+    *,
+    emulator: str | Path | None = None,
+    samples: int = PRESSES,
+    workers: int = 1,
+    seed: int = 0,
+    progress: Callable[[str, float], None] | None = None,
+) -> tuple[TracedLight, ...]:
+    """Trace presses of a design's sensor, write what is learned to `out` and return it, one for each band.
+
+    Parameters
+    ----------
+    out : name of the file, ending in ``.npz``.
+    emulator : of the design's mechanics; by default the file of its name in `presses.EMULATORS`.
+    samples : presses, 64 or more.
+
+    Raises
+    ------
+    DesignError
+        In one line.
+    """
+    from scenes import spectral, traced
+
+    target = check_file(out, "out", ".npz")
+    if samples < 64:
+        raise DesignError("samples", shown(samples), "64 or more")
+    file = Path(emulator) if emulator is not None else presses.EMULATORS / f"{design.name}.npz"
+    known = presses.emulator_of(design, file)
+    folder = target.with_name(target.name + ".presses")
+    folder.mkdir(parents=True, exist_ok=True)
+    tasks = tasks_of(design, known, str(file), samples, seed, folder)
+    tell = progress or (lambda stage, share: None)
+    left = [task for task in tasks if not _kept(task)]
+    tell("presses", 1.0 - len(left) / len(tasks))
+    with ProcessPoolExecutor(max(workers, 1), multiprocessing.get_context("spawn"), _one_thread) as pool:
+        try:
+            done = [pool.submit(trace, task) for task in left]
+            for number, one in enumerate(as_completed(done), start=1):
+                one.result()
+                tell("presses", 1.0 - (len(left) - number) / len(tasks))
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    tell("fit", 1.0)
+    sensors = spectral.band_sensors(design.sensor(), count=design.light.bands, at=design.sensor)
+    found = [_read(path) for task in tasks for path in _files(task)]
+    learned = tuple(
+        traced.learn(sensor, [one[0] for one in found], [one[1][number] for one in found])
+        for number, (_, _, sensor) in enumerate(sensors)
+    )
+    with staged_file(out, "out", ".npz") as place:
+        traced.save(learned, place)
+    return learned
+
+
+def tasks_of(
+    design: Design, emulator: fem.Emulator, file: str, samples: int, seed: int, folder: Path
+) -> list[Task]:
+    """Return the presses to trace: a Sobol sequence over inclusions, depths and `_NUISANCE`."""
+    ranges, tables = emulator.plan.ranges, tables_of(design)
+    found: list[Task] = []
+    rng = np.random.default_rng(seed)
+    for unit in qmc.Sobol(9, scramble=True, rng=rng).random_base2((2 * samples - 1).bit_length()):
+        if len(found) == samples:
+            break
+        fields = [
+            (name, float(_middle(design, name) * (1.0 + share * (2.0 * u - 1.0))))
+            for (name, share), u in zip(_NUISANCE.items(), unit[6:], strict=True)
+        ]
+        away = min(ranges.offset_mm, 0.1 * design.waveguide.width_mm)
+        inclusion = fem.Inclusion(
+            _between(ranges.size_mm, unit[0]),
+            _between(ranges.depth_mm, unit[1]),
+            _between(ranges.modulus_kPa, unit[2]),
+            (away * (2 * float(unit[3]) - 1), away * (2 * float(unit[4]) - 1)),
+        )
+        low, high = ranges.indentation_mm
+        depth = _between((max(low, 0.3 * high), high), unit[5])
+        changed = parse_design(put(tables, fields))
+        try:
+            presses.check_emulated(changed, inclusion, [depth], emulator)
+        except fem.NotModelled:
+            continue
+        number = len(found)
+        blank = number % _BLANK_EVERY == 0
+        place = folder / f"{seed}.{number:04d}.npz"
+        found.append(Task(changed, inclusion, depth, file, seed * 10_000 + number, blank, place))
+    return found
+
+
+def trace(task: Task) -> None:
+    """Trace a press and write its description and traced light; runs in a worker process."""
+    from scenes import SpectralRenderer, surface, traced, transport
+    from twin.labour import give_back
+    from twin.sample import _emulator
+
+    press = presses.emulated(task.design, task.inclusion, [task.depth_mm], _emulator(task.emulator))[0]
+    renderer = SpectralRenderer(
+        task.design.sensor(), count=task.design.light.bands, at=task.design.sensor, device="cpu"
+    )
+    for field, path in zip(("pressure", "pressure_0"), _files(task), strict=False):
+        seen = renderer.render(press.surface, field=field, seed=task.seed % 2**26)
+        assert seen.traced is not None
+        one = renderer.renderers[0]
+        shape = surface.resample(
+            press.surface, one.sensor.guide.width_mm, suffix=field.removeprefix("pressure")
+        )
+        ground = transport.survey(one.scene, one.sensor)
+        arrays = {"description": traced.describe(shape, ground.fraction).astype(np.float32)}
+        arrays |= {
+            f"traced.{number}": traced.blocks(maps, _CELLS).astype(np.float32)
+            for number, maps in enumerate(seen.traced)
+        }
+        _write(path, arrays)
+    give_back()
+
+
+def summary(light: tuple[TracedLight, ...], out: str) -> str:
+    """Return what a person wants to know of learned light, several lines."""
+    lines = [
+        f"traced light: {one.presses} presses, each left out in turn {one.error_percent:.2g} % off in all of "
+        "it, noise of the tracing included"
+        for one in light
+    ]
+    return "\n".join([*lines, f"file: {out}"])
+
+
+def _files(task: Task) -> list[Path]:
+    blank = task.place.with_name(task.place.name.removesuffix(".npz") + ".blank.npz")
+    return [task.place, blank] if task.blank else [task.place]
+
+
+def _kept(task: Task) -> bool:
+    try:
+        return all(_read(path) is not None for path in _files(task))
+    except (OSError, ValueError, KeyError):
+        return False
+
+
+def _write(path: Path, arrays: dict[str, NDArray[np.float32]]) -> None:
+    part = path.with_name(f".{path.name}.{os.getpid()}.part.npz")
+    np.savez_compressed(part, allow_pickle=False, **arrays)
+    os.replace(part, path)
+
+
+def _read(path: Path) -> tuple[NDArray[np.float32], list[NDArray[np.float32]]]:
+    with np.load(path, allow_pickle=False) as file:
+        bands = [file[f"traced.{number}"] for number in range(len(file.files) - 1)]
+        return file["description"], bands
+
+
+def _between(ends: tuple[float, float], share: float) -> float:
+    return float(ends[0] + (ends[1] - ends[0]) * share)
+
+
+def _middle(design: Design, name: str) -> float:
+    room, _, field = name.partition(".")
+    return float(getattr(getattr(design, room), field))
+
+
+def _one_thread() -> None:
+    from scenes import backend
+
+    backend.use("cpu")
+    import drjit as dr
+
+    dr.set_thread_count(1)
