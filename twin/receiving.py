@@ -327,7 +327,7 @@ def _check_count(given: int, wanted: Wanted, exposures: int, field: str, what: s
         depths = ", ".join(f"{depth:g}" for depth in wanted.indentation_mm)
         each = f"{exposures} for each" if exposures > 1 else "one for each"
         allowed = f"{each} of the model's press levels, {depths} mm (--frames N: N exposures for each)"
-        raise DesignError(field, f"{given} {what}", allowed)
+        raise DesignError(field, f"{given} {what[:-1] if given == 1 else what}", allowed)
 
 
 def _check_frames(frames: int, wanted: Wanted) -> None:
