@@ -102,7 +102,8 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
 
 
 def _parser() -> Parser:
-    from twin import corpus_arguments, study_arguments  # which takes its readers from here
+    # which take their readers from here
+    from twin import corpus_arguments, estimate_arguments, study_arguments
 
     parser = Parser(
         prog="twin",
@@ -181,6 +182,7 @@ def _parser() -> Parser:
 
     corpus_arguments.add(verbs)
     study_arguments.add(verbs)
+    estimate_arguments.add(verbs)
     add_verb(verbs, "schema", "the JSON schema of a design file", _SCHEMA)
     return parser
 

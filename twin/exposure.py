@@ -50,8 +50,13 @@ def take_reference(
     design: Design, radiance: NDArray[np.floating], seed: int, level: float
 ) -> NDArray[np.float32]:
     """Return the mean of so many noisy pictures of the press without inclusion; arguments as of `take`."""
-    frames = max(REFERENCE_FRAMES, design.camera.frames)
+    frames = reference_frames(design)
     return _expose(design, radiance, seed, _REFERENCE, level, frames).astype(np.float32)
+
+
+def reference_frames(design: Design) -> int:
+    """Return of how many exposures the camera's reference is the mean."""
+    return max(REFERENCE_FRAMES, design.camera.frames)
 
 
 def _expose(

@@ -78,7 +78,9 @@ class Frame:
     ``error_percent``, ``dof`` and ``seconds``, as `fem.Press` explains them. From an emulator, ``mechanics``
     is "emulator", ``emulated`` what it learned ("finite" or "linear"), and ``dof`` None."""
     tsis: dict[str, Any] = field(default_factory=dict)
-    """Scalars ``raw`` and ``tared`` of the picture, ``seconds``, ``noise_percent``, ``saturated_percent``."""
+    """Scalars ``raw`` and ``tared`` of the picture, ``saturated_percent``, ``frames`` and
+    ``reference_frames`` (exposures that picture and reference are the mean of), ``seconds``,
+    ``noise_percent``."""
 
     @property
     def tared(self) -> NDArray[np.float32]:

@@ -18,6 +18,7 @@ from twin.exposure import (
     light_seed,
     mechanics_facts,
     picture_facts,
+    reference_frames,
     seen_pressure,
     take,
     take_reference,
@@ -242,6 +243,8 @@ def _frame(
         },
         tsis={
             **picture_facts(design, image, reference, lit.radiance),
+            "frames": design.camera.frames,
+            "reference_frames": reference_frames(design),
             "seconds": time.perf_counter() - start,
             "noise_percent": lit.noise_percent,
         },

@@ -1,0 +1,72 @@
+"""What the verbs of learned estimators accept: ``twin train`` and ``twin estimate``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from twin.arguments import add_verb, number, whole
+
+_TRAIN = """\
+Learn from a corpus to tell an inclusion's size, depth and modulus from pictures, with how sure that is, and
+whether there is one at all. Writes MODEL.safetensors and MODEL.json, a card of what it was trained for and of
+how well it does on samples that it has not seen. What is done is kept beside them: the same command goes on
+with it, also after Ctrl-C.
+
+examples:
+  twin train corpora/train --out models/tsis
+  twin train corpora/train --levels 0 2 --minutes 40 --seed 1 --out models/two-levels
+"""
+
+_ESTIMATE = """\
+Tell an inclusion from pictures of a trained model's sensor: size, depth and modulus with 90 % intervals, and
+the probability that there is one. Pictures that the model cannot take, or that are unlike those that it was
+trained for, are refused in one line. With --out: estimate.json, and overview.png to look at.
+
+FRAME is a folder of `twin simulate` (one press level or all), or a camera's PNG file of 8 or 16 bits, one for
+each of the model's press levels in order; these need --reference: the same presses without inclusion, in the
+same order. A camera below the sensor sees the mirror image, which --flip turns round. With --frames N each
+level has N exposures, those of the first level first; references may be several for each level, too.
+
+examples:
+  twin simulate tsis --size 10 --depth 5 --modulus 100 --indentation 1 2 3 --out levels
+  twin estimate models/tsis levels --out estimate
+  twin estimate models/tsis 1mm.png 2mm.png 3mm.png --reference r1.png r2.png r3.png --flip --out estimate
+  twin estimate models/tsis 1mm-*.png 2mm-*.png 3mm-*.png --frames 10 --reference r?mm-*.png --flip
+"""
+
+
+def add(verbs: Any) -> None:
+    """Add both verbs to the parser of `twin.arguments`."""
+    train = add_verb(verbs, "train", "learn to estimate inclusions from the pictures of a corpus", _TRAIN)
+    train.add_argument("corpus", metavar="CORPUS", help="folder of a finished corpus")
+    train.add_argument("--out", metavar="MODEL", help="model to write, without its ending")
+    train.add_argument(
+        "--levels", type=whole, nargs="+", metavar="N", help="press levels to use, from 0 (default: all)"
+    )
+    train.add_argument(
+        "--minutes", type=number(above=0.0), default=20.0, metavar="MIN", help="time to train (default 20)"
+    )
+    train.add_argument("--seed", type=whole, default=0, metavar="N", help="of all random numbers (default 0)")
+
+    estimate = add_verb(verbs, "estimate", "an inclusion from pictures, with how sure that is", _ESTIMATE)
+    estimate.add_argument("model", metavar="MODEL", help="what twin train wrote")
+    estimate.add_argument("frames", metavar="FRAME", nargs="+", help="folder of twin simulate, or PNG file")
+    estimate.add_argument(
+        "--reference", metavar="FILE", nargs="+", default=[], help="PNG files of the press without inclusion"
+    )
+    estimate.add_argument(
+        "--frames",
+        dest="exposures",
+        type=whole,
+        default=1,
+        metavar="N",
+        help="FRAMEs of each press level, to be averaged (default 1)",
+    )
+    estimate.add_argument("--flip", action="store_true", help="the files are seen from below, mirrored")
+    estimate.add_argument("--out", metavar="DIR", help="new folder for estimate.json and overview.png")
+    estimate.add_argument(
+        "--samples", type=whole, default=4000, metavar="N", help="of the posterior (default 4000)"
+    )
+    estimate.add_argument(
+        "--seed", type=whole, default=0, metavar="N", help="of the posterior's samples (default 0)"
+    )

@@ -1,0 +1,60 @@
+"""What ``twin train`` and ``twin estimate`` do."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from twin.complaint import DesignError, shown
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the verb of a parsed command line and return the exit status."""
+    return {"train": _train, "estimate": _estimate}[arguments.verb](arguments)
+
+
+def _train(arguments: argparse.Namespace) -> int:
+    if arguments.out is None:
+        raise DesignError("--out", "nothing", "the model to write, such as models/tsis")
+    levels = arguments.levels
+    if levels is not None and len(set(levels)) < len(levels):
+        raise DesignError("--levels", shown(levels), "each press level once")
+    from twin.reporting import Reporter
+    from twin.train import train
+
+    with Reporter() as report:
+        written = train(
+            arguments.corpus,
+            arguments.out,
+            levels=levels,
+            minutes=arguments.minutes,
+            seed=arguments.seed,
+            progress=report,
+        )
+    print(written)
+    return 0
+
+
+def _estimate(arguments: argparse.Namespace) -> int:
+    for flag, value, least in (("--frames", arguments.exposures, 1), ("--samples", arguments.samples, 100)):
+        if value < least:
+            raise DesignError(flag, str(value), f"an integer >= {least}")
+    from twin import estimate
+    from twin.reporting import Reporter
+
+    with Reporter() as report:
+        found = estimate.estimate(
+            arguments.model,
+            arguments.frames,
+            references=arguments.reference,
+            exposures=arguments.exposures,
+            flip=arguments.flip,
+            out=arguments.out,
+            samples=arguments.samples,
+            seed=arguments.seed,
+            progress=report,
+        )
+    print(estimate.told(found))
+    if arguments.out is not None:
+        print(f"look at: {Path(arguments.out) / estimate.PICTURE}")
+    return 0

@@ -1,0 +1,48 @@
+"""What is known of an inclusion after its pictures were seen: a posterior, never a bare point."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+NAMES = ("size_mm", "depth_mm", "modulus_kPa")
+"""Parameters of an inclusion, in the order of every array here; the depth is that of its top."""
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Posterior of an inclusion's (size, depth, modulus), given pictures; mm, mm, kPa.
+
+    Attributes
+    ----------
+    names : of the parameters, `NAMES`.
+    samples : (n, 3) float64 of the posterior, given that there is an inclusion.
+    mean : (3,) of the posterior.
+    covariance : (3, 3) of the posterior.
+    interval : (3, 2) lower and upper end of the central 90 %.
+    presence : probability that there is an inclusion, 0 to 1.
+    likeness : share of valid pictures that are less like the model's own than these, 0 to 1.
+    refused : why the pictures are not answered, in one line; None where they are.
+    observed : (levels, r, c) tared counts of the coarse picture that was seen.
+    predicted : (levels, r, c) the same as expected at the posterior mean.
+    noise : (levels, r, c) standard deviation of observed minus predicted, counts.
+    """
+
+    names: tuple[str, ...]
+    samples: NDArray[np.float64]
+    mean: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    interval: NDArray[np.float64]
+    presence: float
+    likeness: float
+    refused: str | None
+    observed: NDArray[np.float64]
+    predicted: NDArray[np.float64]
+    noise: NDArray[np.float64]
+
+
+def probability(value: float) -> str:
+    """Return a probability in three figures, never as a certainty that no posterior has."""
+    return "> 0.999" if value > 0.9995 else "< 0.001" if value < 0.0005 else f"{value:.3f}"
