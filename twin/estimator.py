@@ -83,7 +83,8 @@ class Estimator:
         ).reshape(2, 1, 1)
         reason = None
         if likeness < self.card["refuse_below"]:
-            reason = f"pictures less like this sensor's than {100 * (1 - self.card['refuse_below']):g} % of its own"
+            share = 100 * (1 - self.card["refuse_below"])
+            reason = f"pictures less like this sensor's than {share:g} % of its own"
         return Estimate(
             NAMES,
             wanted,
@@ -188,7 +189,9 @@ def load_estimator(path: str | Path) -> Estimator:
     """
     place = Path(path)
     name = str(place)
-    if place.suffix != ".safetensors" or not place.is_file() or not card_of(place).is_file():
+    if place.suffix != ".safetensors":
+        place = place.with_name(place.name + ".safetensors")
+    if not place.is_file() or not card_of(place).is_file():
         allowed = "a .safetensors file of `twin train`, its .json beside it"
         raise DesignError("MODEL", shown(name), allowed)
     try:
@@ -209,7 +212,9 @@ def load_estimator(path: str | Path) -> Estimator:
         safetensors.SafetensorError,
     ) as error:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise DesignError("MODEL", f"files that do not fit ({reason})", "those of `twin train`", source=name) from None
+        raise DesignError(
+            "MODEL", f"files that do not fit ({reason})", "those of `twin train`", source=name
+        ) from None
 
 
 def _card(place: Path) -> dict[str, Any]:
@@ -238,13 +243,15 @@ def _assembled(card: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Estimat
         tuple(int(side) for side in said["shape"]),
     )
     pixels = int(np.prod(light.shape))
-    features = Features(
-        *(arrays[f"features.{name}"] for name in ("mean", "axes", "noise", "spread")),
-        shape=tuple(int(side) for side in card["features"]),
-    )
+    mean, axes, noise, spread = (arrays[f"features.{name}"] for name in ("mean", "axes", "noise", "spread"))
+    levels, two, rows, columns = (int(side) for side in card["features"])
+    features = Features(mean, axes, noise, spread, (levels, two, rows, columns))
     k = len(features.spread)
     prior = Prior(
-        arrays["prior.ranges"], tuple(map(str, card["nuisances"])), arrays["prior.mean"], arrays["prior.basis"]
+        arrays["prior.ranges"],
+        tuple(map(str, card["nuisances"])),
+        arrays["prior.mean"],
+        arrays["prior.basis"],
     )
     fits = (
         light.axes.shape[0] == len(light.centre)
