@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 Single = NDArray[np.float32]
 
+_AT_ONCE = 2048
 _SEEN = 0.05
 """Least variance of a component that is kept, over the noise of a single exposure."""
 
@@ -74,7 +75,11 @@ def compress(pictures: NDArray[np.floating], noise: NDArray[np.floating], *, mos
     x = first.stacked(pictures)
     mean = x.mean(axis=0)
     x -= mean
-    values, vectors = np.linalg.eigh((x @ x.T).astype(np.float64))
+    gram = np.zeros((len(x), len(x)))
+    for start in range(0, x.shape[1], _AT_ONCE):  # single precision would leave components of its own
+        part = x[:, start : start + _AT_ONCE].astype(np.float64)
+        gram += part @ part.T
+    values, vectors = np.linalg.eigh(gram)
     order = np.argsort(values)[::-1][:most]
     spread = np.sqrt(np.maximum(values[order], 0.0) / len(x))
     keep = order[spread**2 > _SEEN]

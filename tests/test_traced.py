@@ -1,0 +1,110 @@
+"""Traced light learned from many presses: recovered where it is smooth, refused where it does not belong."""
+
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_simulate import small
+
+from scenes import traced
+from scenes.sensor import NotModelled, Sensor
+from scenes.surface import OpticalSurface
+
+
+def presses(n: int, seed: int) -> tuple[list[OpticalSurface], list[np.ndarray], list[np.ndarray]]:
+    """Dents of three hidden numbers, and light that is a quadratic of them."""
+    rng = np.random.default_rng(seed)
+    line = np.linspace(-12.5, 12.5, 65)
+    shapes = [np.cos(np.add.outer(k * line / 5.0, line / (2.0 + k))) for k in range(3)]
+    cells = np.linspace(-1, 1, 100)
+    patterns = [np.exp(-np.add.outer((cells - 0.2 * k) ** 2, cells**2)) for k in range(-2, 3)]
+    surfaces, fractions, light = [], [], []
+    for hidden in rng.uniform(-1, 1, (n, 3)):
+        moved = np.zeros((65, 65, 3))
+        moved[..., 2] = -0.1 * sum(h * shape for h, shape in zip(hidden, shapes, strict=True))
+        surfaces.append(OpticalSurface(line, moved, np.ones((65, 65)), np.zeros((65, 65))))
+        fraction = 0.3 + 0.1 * sum(h * p for h, p in zip(hidden, patterns, strict=False))
+        fractions.append(fraction)
+        amounts = [1.0, *(0.1 * hidden), 0.05 * hidden[0] ** 2]
+        one = sum(a * p for a, p in zip(amounts, patterns, strict=True))
+        light.append(0.01 * np.broadcast_to(one, (4, 2, 100, 100)))
+    return surfaces, fractions, light
+
+
+@pytest.fixture(scope="module")
+def sensor() -> Sensor:
+    design = small()
+    return replace(
+        design.sensor(),
+        leds=tuple(replace(design.sensor().leds[0], side=s) for s in ("+x", "-x", "+y", "-y")),
+    )
+
+
+@pytest.fixture(scope="module")
+def learned(sensor) -> traced.TracedLight:
+    surfaces, fractions, light = presses(120, 0)
+    told = [traced.describe(*one) for one in zip(surfaces, fractions, strict=True)]
+    return traced.learn(sensor, told, light)
+
+
+def test_smooth_light_is_recovered(learned, sensor):
+    for surface, fraction, light in zip(*presses(10, 1), strict=True):
+        found = learned.at(sensor, surface, fraction) * 0.01 / sensor.leds[0].flux_W
+        assert np.abs(found - light).max() < 3e-3 * light.max()
+    assert learned.error_percent < 0.2
+
+
+def test_light_follows_the_leds_power(learned, sensor):
+    surface, fraction, _ = (one[0] for one in presses(1, 2))
+    twice = replace(
+        sensor, leds=(replace(sensor.leds[0], flux_W=2 * sensor.leds[0].flux_W), *sensor.leds[1:])
+    )
+    before, after = (learned.at(one, surface, fraction) for one in (sensor, twice))
+    assert np.allclose(after[0], 2 * before[0]) and np.allclose(after[1:], before[1:])
+
+
+def test_light_of_another_sensor_is_refused(learned, sensor):
+    surface, fraction, _ = (one[0] for one in presses(1, 2))
+    other = replace(sensor, leds=(replace(sensor.leds[0], z_mm=sensor.leds[0].z_mm - 1), *sensor.leds[1:]))
+    with pytest.raises(NotModelled, match="learned of another sensor"):
+        learned.at(other, surface, fraction)
+    camera = replace(sensor, camera=replace(sensor.camera, exposure_ms=1.0))
+    assert np.isfinite(learned.at(camera, surface, fraction)).all()
+
+
+def test_a_press_far_from_what_was_learned_is_refused(learned, sensor):
+    surface, fraction, _ = (one[0] for one in presses(1, 2))
+    far = replace(surface, displacement_mm=30 * surface.displacement_mm)
+    with pytest.raises(NotModelled, match="as far out as those learned"):
+        learned.at(sensor, far, fraction)
+
+
+def test_files_come_back_as_they_were(learned, sensor, tmp_path):
+    traced.save([learned], tmp_path / "light.npz")
+    (again,) = traced.load(tmp_path / "light.npz")
+    surface, fraction, _ = (one[0] for one in presses(1, 3))
+    assert np.array_equal(again.at(sensor, surface, fraction), learned.at(sensor, surface, fraction))
+
+
+class Bomb:
+    def __reduce__(self):
+        return (exec, ("raise SystemExit('a pickle ran')",))
+
+
+def test_hostile_files_are_refused(learned, tmp_path):
+    place = tmp_path / "light.npz"
+    np.savez(place, format=np.array([Bomb()], dtype=object))
+    with pytest.raises(NotModelled, match="no traced light"):
+        traced.load(place)
+    place.write_bytes(pickle.dumps(Bomb()))
+    with pytest.raises(NotModelled, match="no traced light"):
+        traced.load(place)
+    for change in (
+        {"modes": learned.modes[:, :1]},
+        {"centre": learned.centre * np.nan},
+        {"reach": -learned.reach},
+    ):
+        traced.save([replace(learned, **change)], place)
+        with pytest.raises(NotModelled, match="no traced light"):
+            traced.load(place)
