@@ -8,13 +8,13 @@ from twin.arguments import add_verb, number, whole
 
 _TRAIN = """\
 Learn from a corpus to tell an inclusion's size, depth and modulus from pictures, with how sure that is, and
-whether there is one at all. Writes MODEL.safetensors and MODEL.json, a card of what it was trained for and of
+whether there is one at all. Writes MODEL and, beside it, a card (NAME.json) of what it was trained for and of
 how well it does on samples that it has not seen. What is done is kept beside them: the same command goes on
 with it, also after Ctrl-C.
 
 examples:
-  twin train corpora/train --out models/tsis
-  twin train corpora/train --levels 0 2 --minutes 40 --seed 1 --out models/two-levels
+  twin train corpora/train --out models/tsis.safetensors
+  twin train corpora/train --levels 0 2 --minutes 40 --seed 1 --out models/two-levels.safetensors
 """
 
 _ESTIMATE = """\
@@ -29,9 +29,9 @@ level has N exposures, those of the first level first; references may be several
 
 examples:
   twin simulate tsis --size 10 --depth 5 --modulus 100 --indentation 1 2 3 --out levels
-  twin estimate models/tsis levels --out estimate
-  twin estimate models/tsis 1mm.png 2mm.png 3mm.png --reference r1.png r2.png r3.png --flip --out estimate
-  twin estimate models/tsis 1mm-*.png 2mm-*.png 3mm-*.png --frames 10 --reference r?mm-*.png --flip
+  twin estimate tsis.safetensors levels --out estimate
+  twin estimate tsis.safetensors 1mm.png 2mm.png 3mm.png --reference r1.png r2.png r3.png --flip --out found
+  twin estimate tsis.safetensors 1mm-*.png 2mm-*.png 3mm-*.png --frames 10 --reference r?mm-*.png --flip
 """
 
 
@@ -39,7 +39,7 @@ def add(verbs: Any) -> None:
     """Add both verbs to the parser of `twin.arguments`."""
     train = add_verb(verbs, "train", "learn to estimate inclusions from the pictures of a corpus", _TRAIN)
     train.add_argument("corpus", metavar="CORPUS", help="folder of a finished corpus")
-    train.add_argument("--out", metavar="MODEL", help="model to write, without its ending")
+    train.add_argument("--out", metavar="MODEL", help="model to write, FILE.safetensors")
     train.add_argument(
         "--levels", type=whole, nargs="+", metavar="N", help="press levels to use, from 0 (default: all)"
     )

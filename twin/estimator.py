@@ -209,7 +209,9 @@ def load_estimator(path: str | Path) -> Estimator:
         safetensors.SafetensorError,
     ) as error:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise DesignError("MODEL", f"files that do not fit ({reason})", "those of `twin train`", source=name) from None
+        raise DesignError(
+            "MODEL", f"files that do not fit ({reason})", "those of `twin train`", source=name
+        ) from None
 
 
 def _card(place: Path) -> dict[str, Any]:
@@ -244,7 +246,10 @@ def _assembled(card: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Estimat
     )
     k = len(features.spread)
     prior = Prior(
-        arrays["prior.ranges"], tuple(map(str, card["nuisances"])), arrays["prior.mean"], arrays["prior.basis"]
+        arrays["prior.ranges"],
+        tuple(map(str, card["nuisances"])),
+        arrays["prior.mean"],
+        arrays["prior.basis"],
     )
     fits = (
         light.axes.shape[0] == len(light.centre)

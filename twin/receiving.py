@@ -26,8 +26,8 @@ from twin.sound import check_exposure, check_pair, check_same
 
 Float = NDArray[np.float32]
 
-_OFF = 0.1
-"""Share of a press level that a simulated frame's may be off."""
+_OFF = 0.03
+"""Share of a press level that a simulated frame's may be off: no more than an estimator allows for."""
 _MOST_FRAMES = 10_000
 """As a camera may average."""
 _MOST_RECORD = 2**20  # bytes
