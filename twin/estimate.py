@@ -11,7 +11,7 @@ from typing import Any
 from twin import interrupt
 from twin.complaint import DesignError, shown
 from twin.design import Design, parse_design
-from twin.estimates import NAMES, Estimate, probability
+from twin.estimates import NAMES, Estimate, decimals, probability
 from twin.frame import versions
 from twin.received import Received, wanted_of
 from twin.receiving import receive
@@ -22,7 +22,7 @@ RECORD, PICTURE = "estimate.json", "overview.png"
 
 _UNKNOWN = 0.8
 """Width of a 90 % interval over that of 90 % of the range, above which the pictures tell nothing."""
-_WORDS = {"size_mm": ("size", "mm", 1), "depth_mm": ("depth", "mm", 1), "modulus_kPa": ("modulus", "kPa", 0)}
+_WORDS = {"size_mm": ("size", "mm"), "depth_mm": ("depth", "mm"), "modulus_kPa": ("modulus", "kPa")}
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,7 +174,8 @@ def told(found: Found) -> str:
     chance = f"probability of an inclusion: {probability(answer.presence)}"
     lines = [chance if answer.presence >= 0.5 else f"{chance}; if there is one:"]
     for index, name in enumerate(answer.names):
-        word, unit, digits = _WORDS[name]
+        word, unit = _WORDS[name]
+        digits = decimals(answer.covariance[index, index] ** 0.5)
         below, above = answer.interval[index]
         span = f"{below:.{digits}f} to {above:.{digits}f}"
         line = f"  {word:<8} {answer.mean[index]:6.{digits}f} {unit:<4} 90 %: {span}"
