@@ -50,5 +50,5 @@ def probability(value: float) -> str:
 
 
 def decimals(sd: float) -> int:
-    """Return how many decimals a value deserves that is known as well as this, 0 to 3."""
-    return 3 if sd <= 1e-3 else min(max(-math.floor(math.log10(sd)), 0), 3)
+    """Return how many decimals give two figures of a standard deviation, 0 to 3."""
+    return 3 if sd <= 1e-3 else min(max(1 - math.floor(math.log10(sd)), 0), 3)
