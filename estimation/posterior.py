@@ -164,6 +164,26 @@ class Training:
         network.spread.copy_(torch.from_numpy(simulated.present.std(axis=0) + np.float32(1.0)))
         return Training(network, torch.optim.AdamW(network.parameters(), lr=1e-3, weight_decay=1e-4))
 
+    def state(self) -> dict[str, Tensor]:
+        """Return all tensors that going on needs, by name."""
+        found = {f"network.{name}": value for name, value in self.network.state_dict().items()}
+        for number, one in self.optimiser.state_dict()["state"].items():
+            found |= {f"optimiser.{number}.{name}": value for name, value in one.items()}
+        return {name: value.detach().clone() for name, value in found.items()}
+
+    def restore(self, state: Mapping[str, Tensor], said: Mapping[str, Any]) -> None:
+        """Go back to `state`, at the step and best loss that ``said`` tells."""
+        parts = {n.removeprefix("network."): v for n, v in state.items() if n.startswith("network.")}
+        self.network.load_state_dict(parts)
+        whole = self.optimiser.state_dict()
+        slots: dict[int, dict[str, Tensor]] = {}
+        for name, value in state.items():
+            if name.startswith("optimiser."):
+                _, number, what = name.split(".")
+                slots.setdefault(int(number), {})[what] = value
+        self.optimiser.load_state_dict({**whole, "state": slots})
+        self.step, self.best = int(said["step"]), float(said["best"])
+
 
 def train(
     training: Training,
@@ -173,19 +193,25 @@ def train(
     batch: int = 512,
     seed: int = 0,
     until: float = math.inf,
+    best: dict[str, Tensor] | None = None,
     tell: Callable[[int, float], None] | None = None,
+    keep: Callable[[dict[str, Tensor]], None] | None = None,
 ) -> dict[str, Tensor]:
     """Go on to ``steps``, or till the clock (`time.monotonic`) says ``until``; return the best state.
 
     Every step's random numbers are children of (seed, step), so that one that was stopped comes out as if it
-    had not been. The learning rate falls as half a cosine wave. One specimen in twenty is kept aside, and
-    tells which state is best.
+    had not been. The learning rate falls as half a cosine wave, in time where that is short. One specimen in
+    twenty is kept aside, and tells which state is best; ``best`` is the best before. ``keep`` takes it every
+    250 steps.
     """
     n = len(simulated.unit)
     aside, rest = np.arange(0, n, 20), np.setdiff1d(np.arange(n), np.arange(0, n, 20))
-    network, best = training.network, _state(training.network)
-    while training.step < steps and time.monotonic() < until:
-        rate = 1e-3 * 0.5 * (1.0 + math.cos(math.pi * training.step / steps)) + 1e-6
+    network = training.network
+    best = best or _state(network)
+    began = time.monotonic()
+    while training.step < steps and (now := time.monotonic()) < until:
+        share = max(training.step / steps, (now - began) / (until - began))
+        rate = 1e-3 * 0.5 * (1.0 + math.cos(math.pi * share)) + 1e-6
         for group in training.optimiser.param_groups:
             group["lr"] = rate
         rng = np.random.default_rng([seed, training.step])
@@ -200,6 +226,8 @@ def train(
                 found = float(_loss(network, simulated, np.repeat(aside, 4), rng))
             if found < training.best:
                 training.best, best = found, _state(network)
+            if keep is not None:
+                keep(best)
             if tell is not None:
                 tell(training.step, found)
     return best

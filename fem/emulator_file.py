@@ -51,7 +51,7 @@ def save_emulator(emulator: Emulator, place: str | Path) -> None:
 
 
 def load_emulator(place: str | Path | BinaryIO) -> Emulator:
-    """Read an emulator from a file; nothing in the file is trusted: no pickles, all shapes and numbers are checked.
+    """Read an emulator; nothing in the file is trusted: no pickles, all shapes and numbers are checked.
 
     Raises
     ------

@@ -83,7 +83,8 @@ class Estimator:
         ).reshape(2, 1, 1)
         reason = None
         if likeness < self.card["refuse_below"]:
-            reason = f"pictures less like this sensor's than {100 * (1 - self.card['refuse_below']):g} % of its own"
+            share = 100 * (1 - self.card["refuse_below"])
+            reason = f"pictures less like this sensor's than {share:g} % of its own"
         return Estimate(
             NAMES,
             wanted,
@@ -188,7 +189,9 @@ def load_estimator(path: str | Path) -> Estimator:
     """
     place = Path(path)
     name = str(place)
-    if place.suffix != ".safetensors" or not place.is_file() or not card_of(place).is_file():
+    if place.suffix != ".safetensors":
+        place = place.with_name(place.name + ".safetensors")
+    if not place.is_file() or not card_of(place).is_file():
         allowed = "a .safetensors file of `twin train`, its .json beside it"
         raise DesignError("MODEL", shown(name), allowed)
     try:
@@ -240,10 +243,9 @@ def _assembled(card: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Estimat
         tuple(int(side) for side in said["shape"]),
     )
     pixels = int(np.prod(light.shape))
-    features = Features(
-        *(arrays[f"features.{name}"] for name in ("mean", "axes", "noise", "spread")),
-        shape=tuple(int(side) for side in card["features"]),
-    )
+    mean, axes, noise, spread = (arrays[f"features.{name}"] for name in ("mean", "axes", "noise", "spread"))
+    levels, two, rows, columns = (int(side) for side in card["features"])
+    features = Features(mean, axes, noise, spread, (levels, two, rows, columns))
     k = len(features.spread)
     prior = Prior(
         arrays["prior.ranges"],

@@ -1,0 +1,178 @@
+"""How well an estimator does on samples that it has not seen, beside the bound of its own forward model.
+
+Pictures of one exposure are the stored ones, as the camera took them. Means of many are drawn from the stored
+light: block means with the normal noise that so many exposures leave.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+import fem
+from estimation.posterior import REFERENCE_FRAMES
+from twin.corpus import Corpus
+from twin.estimates import NAMES
+from twin.estimator import Estimator
+from twin.fitting import bound
+from twin.imagined import Brightness, noise_variance
+from twin.received import Received
+
+if TYPE_CHECKING:
+    from twin.train import Seen
+
+Floats = NDArray[np.float64]
+
+FRAMES = (1, 100)
+LEAST_MM, LARGE_MM = 4.0, 8.0
+"""Sizes from which an inclusion counts as seen, and from which its modulus should show."""
+_DRAWS = 2000
+_MODEL_BASED = 100  # samples that the model-based estimator is tried on
+_BINS = 20  # of ranks
+
+
+def assess(
+    estimator: Estimator,
+    source: Corpus,
+    seen: Seen,
+    levels: Sequence[int],
+    seed: int,
+    tell: Callable[[float], None],
+) -> dict[str, Any]:
+    """Return figures of an estimator on held-out samples, by exposures."""
+    rng = np.random.default_rng([seed, 7])
+    there = np.flatnonzero(~seen.blank)
+    truth = np.array([[seen.values[row][name] for name in NAMES] for row in there])
+    bright = Brightness.of(estimator.chain, seen.values)
+    mean = np.einsum(
+        "nlpiyx,ni->nlpyx", seen.charges, bright.flux_W / bright.gain[:, None], optimize=True
+    ).astype(np.float32)
+    variance = noise_variance(estimator.chain.design, mean, bright.gain)
+    found: dict[str, Any] = {"samples": len(there), "blanks": int(seen.blank.sum())}
+    for turn, frames in enumerate(FRAMES):
+        if frames == 1:
+            pictures = np.stack([_stored(estimator, source, int(n), levels) for n in seen.numbers])
+        else:
+            count = np.array([frames, max(frames, REFERENCE_FRAMES)]).reshape(2, 1, 1)
+            pictures = mean + np.sqrt(variance / count) * rng.standard_normal(mean.shape, np.float32)
+        features = estimator.features(pictures)
+        unit = estimator.network.sample(features[there], frames, _DRAWS, seed)
+        drawn = estimator.unscaled(unit)[..., : len(NAMES)]
+        limits = np.full((len(there), len(NAMES)), np.nan)
+        for place, row in enumerate(there):
+            try:
+                least = bound(estimator.chain, estimator.features, estimator.prior, seen.values[row], frames)
+                limits[place] = np.sqrt(np.diag(least)[: len(NAMES)])
+            except fem.NotModelled:
+                continue
+            tell((turn + 0.6 * place / len(there)) / len(FRAMES))
+        models = _model_based(estimator, pictures[there], frames, drawn)
+        presence = estimator.network.present(features, frames)
+        found[str(frames)] = {
+            **_figures(drawn, truth, limits, estimator, models),
+            "presence": _presence(presence, seen.blank, truth),
+        }
+    return found
+
+
+def _stored(estimator: Estimator, source: Corpus, number: int, levels: Sequence[int]) -> NDArray[np.float32]:
+    images = np.stack([source.image(number, level) for level in levels]).astype(np.float32)
+    references = np.stack([source.reference(number, level) for level in levels])
+    frames = source.design.camera.frames
+    received = Received(images, references, frames, max(frames, 16), estimator.card["bits"], ())
+    return estimator.coarse(received)
+
+
+def _model_based(estimator: Estimator, pictures: NDArray[np.float32], frames: int, drawn: Floats) -> Floats:
+    """Most probable parameters of the first samples, (n, 3), from where the network is."""
+    found = []
+    for picture, samples in zip(pictures[:_MODEL_BASED], drawn, strict=False):
+        start = np.concatenate([samples.mean(axis=0), np.zeros(2)])
+        found.append(estimator.fitted(picture, frames, start).x[: len(NAMES)])
+    return np.asarray(found)
+
+
+def _figures(
+    drawn: Floats, truth: Floats, limits: Floats, estimator: Estimator, models: Floats
+) -> dict[str, Any]:
+    error = drawn.mean(axis=1) - truth
+    low, high = np.percentile(drawn, [5.0, 95.0], axis=1)
+    inside = (truth >= low) & (truth <= high)
+    ranks = (drawn < truth[:, None]).mean(axis=1)
+    spans = estimator.prior.ranges[: len(NAMES), 1] - estimator.prior.ranges[: len(NAMES), 0]
+    prior = spans / np.sqrt(12.0)
+    found: dict[str, Any] = {}
+    for name, rows in (
+        ("4 mm and more", truth[:, 0] >= LEAST_MM),
+        ("8 mm and more", truth[:, 0] >= LARGE_MM),
+    ):
+        rmse, least = _rms(error[rows]), _rms(limits[rows])
+        near = models - truth[: len(models)]
+        found[name] = {
+            "samples": int(rows.sum()),
+            "rmse": _named(rmse),
+            "bias": _named(error[rows].mean(axis=0)),
+            "bound": _named(least),
+            "over_bound": _named(rmse / least),
+            "explained": _named((prior**2 - rmse**2) / (prior**2 - least**2)),
+            "posterior_sd": _named(_rms(drawn[rows].std(axis=1))),
+            "model_based_rmse": _named(_rms(near[rows[: len(models)]])),
+            "model_based_network_rmse": _named(_rms(error[: len(models)][rows[: len(models)]])),
+            "model_based_bound": _named(_rms(limits[: len(models)][rows[: len(models)]])),
+        }
+    counts = [np.histogram(ranks[:, place], _BINS, (0.0, 1.0))[0] for place in range(len(NAMES))]
+    found["covered_90"] = _named(inside.mean(axis=0))
+    found["rank_p"] = _named(np.array([stats.chisquare(count).pvalue for count in counts]))
+    return found
+
+
+def _presence(presence: Floats, blank: NDArray[np.bool_], truth: Floats) -> dict[str, Any]:
+    """Area under the curve of all held-out samples, and share of inclusions found at 5 % false alarms."""
+    empty, full = presence[blank], presence[~blank]
+    if not len(empty) or not len(full):
+        return {}
+    area = float((full[:, None] > empty).mean() + 0.5 * (full[:, None] == empty).mean())
+    line = float(np.percentile(empty, 95.0))
+    sizes = ((2.0, 4.0), (4.0, 8.0), (8.0, 99.0))
+    found = {
+        f"{low:g} mm and more": float((full[(truth[:, 0] >= low) & (truth[:, 0] < high)] > line).mean())
+        for low, high in sizes
+        if ((truth[:, 0] >= low) & (truth[:, 0] < high)).any()
+    }
+    return {"area": area, "found_at_5_percent": found}
+
+
+def _rms(values: Floats) -> Floats:
+    return np.asarray(np.sqrt(np.nanmean(values**2, axis=0)))
+
+
+def _named(values: NDArray[Any]) -> dict[str, float]:
+    return {name: float(value) for name, value in zip(NAMES, values, strict=True)}
+
+
+def told(metrics: dict[str, Any], model: str) -> str:
+    """Return what a person wants to know of a trained estimator, several lines."""
+    lines = []
+    for frames in FRAMES:
+        one = metrics.get(str(frames))
+        if one is None:
+            continue
+        for name in ("4 mm and more", "8 mm and more"):
+            part = one[name]
+            words = ", ".join(
+                f"{short} {part['rmse'][key]:.3g} (bound {part['bound'][key]:.3g})"
+                for short, key in zip(("d", "h", "E"), NAMES, strict=True)
+            )
+            lines.append(
+                f"{frames} exposure{'s' * (frames > 1)}, {part['samples']} held-out inclusions of {name}: "
+                f"RMSE {words}; E explained {100 * part['explained']['modulus_kPa']:.0f} %"
+            )
+        covered = ", ".join(f"{100 * value:.0f} %" for value in one["covered_90"].values())
+        lines.append(f"  90 % intervals cover {covered} (d, h, E)")
+        if one["presence"]:
+            lines.append(f"  inclusion or none: area under the curve {one['presence']['area']:.3f}")
+    return "\n".join([*lines, f"model: {model}"])

@@ -1,0 +1,365 @@
+"""`twin train`: from a corpus to an estimator that says how sure it is.
+
+The corpus teaches how contact becomes light (`estimation.light_map`); with that and the corpus's emulator any
+number of specimens are imagined (`twin.imagined`), and a flow learns their posterior
+(`estimation.posterior`). Samples of the group "test" are kept out of all this, and tell how well it does.
+What is done is kept in MODEL.parts.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors.torch
+import torch
+from numpy.typing import NDArray
+
+import fem
+from estimation import light_map, novelty
+from estimation.features import Features, compress
+from estimation.posterior import MOST_FRAMES, REFERENCE_FRAMES, Simulated, Training, restored
+from estimation.posterior import train as train_network
+from twin import assess, retake
+from twin.chain import BLOCK, Chain, contacts
+from twin.complaint import DesignError, shown
+from twin.corpus import Corpus
+from twin.design import Design
+from twin.estimator import Estimator, save_estimator
+from twin.fields import tables_of
+from twin.fitting import prior_of
+from twin.frame import versions
+from twin.imagined import WANTED, Brightness, inputs_of, noise_variance, pictures, simulate, specimens
+
+Progress = Callable[[str, float], None]
+Single = NDArray[np.float32]
+
+TEST = "test"
+"""Name of the group that nothing is learned from."""
+IMAGINED = 16_000
+_LEAST = 30  # samples that a light map is learned from
+_SHOWN = 2500  # specimens that features are found from
+_STEPS = 12_000
+REFUSE_BELOW = 0.01
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Samples of a corpus: their numbers, values by name, contacts and coarse light.
+
+    Attributes
+    ----------
+    contacts : (n, levels, 2, d).
+    charges : (n, levels, 2, n_led, r, c) electrons per watt of each LED.
+    """
+
+    numbers: NDArray[np.int64]
+    values: list[dict[str, float]]
+    blank: NDArray[np.bool_]
+    contacts: Single
+    charges: Single
+
+    def of(self, rows: NDArray[Any]) -> Seen:
+        """Return some of them."""
+        places = np.arange(len(self.numbers))[rows]
+        values = [self.values[place] for place in places]
+        return Seen(self.numbers[rows], values, self.blank[rows], self.contacts[rows], self.charges[rows])
+
+
+def train(
+    corpus: str | Path,
+    out: str | Path,
+    *,
+    levels: Sequence[int] | None = None,
+    minutes: float = 20.0,
+    seed: int = 0,
+    imagined: int = IMAGINED,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> str:
+    """Train an estimator on a corpus, write it as OUT.safetensors and OUT.json, and say how well it does.
+
+    Parameters
+    ----------
+    levels : press levels to use, by number; all by default.
+    minutes : the longest that the network is trained.
+    imagined : specimens that it is trained on.
+
+    Raises
+    ------
+    DesignError
+        In one line, for a corpus that cannot teach this.
+    """
+    tell = progress or (lambda stage, share: None)
+    source, place = Corpus(corpus), Path(f"{out}.safetensors")
+    parts = place.with_name(place.name.removesuffix(".safetensors") + ".parts")
+    plan = source.plan
+    design = _of_levels(source, levels)
+    many = specimens(plan, imagined, seed)
+    if plan.emulator is None:
+        raise DesignError("mechanics", shown(plan.mechanics), '"emulator"', source=source.name)
+    emulator = fem.load_emulator(plan.emulator)
+    chosen = tuple(range(source.levels)) if levels is None else tuple(levels)
+    parts.mkdir(parents=True, exist_ok=True)
+    seen = gather(source, emulator, parts, lambda share: tell("pictures", 0.2 * share))
+    groups = np.array([plan.group(int(number)) for number in seen.numbers])
+    seen = replace(
+        seen,
+        values=[_level_names(one, chosen) for one in seen.values],
+        contacts=seen.contacts[:, list(chosen)],
+        charges=seen.charges[:, list(chosen)],
+    )
+    learning, testing = seen.of(groups != TEST), seen.of(groups == TEST)
+    if len(learning.numbers) < _LEAST:
+        received = f"{len(learning.numbers)} samples"
+        raise DesignError(
+            "samples", received, f"{_LEAST} or more outside the group {TEST!r}", source=source.name
+        )
+    many = [_level_names(one, chosen) for one in many]
+    chain, errors = learn_light(design, emulator, learning)
+    inputs = inputs_of(
+        chain,
+        plan.emulator,
+        many,
+        workers or os.cpu_count() or 1,
+        lambda share: tell("specimens", 0.2 + 0.2 * share),
+    )
+    features = features_of(chain, inputs[:_SHOWN], many[:_SHOWN])
+    error = features(errors) + features.mean @ features.axes.T
+    ranges = np.array([_range(plan, name) for name in WANTED])
+    told = simulate(
+        chain, features, inputs, many, ranges, error, seed, lambda s: tell("noise", 0.4 + 0.1 * s)
+    )
+    key = hashlib.sha256(
+        repr((plan.head.samples.sha256, chosen, seed, imagined, versions())).encode() + told.present.tobytes()
+    ).hexdigest()[:16]
+    network = _network(told, parts / f"{key}.safetensors", minutes, seed, tell)
+    estimator = Estimator(
+        {
+            "name": place.name.removesuffix(".safetensors"),
+            "corpus": source.name,
+            "design": tables_of(design),
+            "design_sha256": plan.head.design_sha256,
+            "shape": list(source.shape),
+            "bits": design.camera.bits,
+            "colour": design.camera.colour,
+            "indentation_mm": list(design.press.indentation_mm),
+            "frames": [1, MOST_FRAMES],
+            "ranges": {name: list(map(float, ranges[place])) for place, name in enumerate(WANTED)},
+            "refuse_below": REFUSE_BELOW,
+            "block": list(BLOCK),
+            "seed": seed,
+            "samples": {"learned": len(learning.numbers), "test": len(testing.numbers), "imagined": imagined},
+            "versions": versions(),
+        },
+        chain,
+        features,
+        network,
+        prior_of(ranges, many),
+        np.asarray(error.T @ error / max(len(error), 1), np.float64),
+        likeness_of(chain, features, inputs[:_SHOWN], many[:_SHOWN], errors, seed),
+    )
+    metrics: dict[str, Any] = {}
+    if len(testing.numbers):
+        metrics = assess.assess(
+            estimator, source, testing, chosen, seed, lambda s: tell("test", 0.9 + 0.1 * s)
+        )
+    estimator = replace(estimator, card={**estimator.card, "metrics": metrics})
+    save_estimator(estimator, plan.emulator, place)
+    return assess.told(metrics, str(place))
+
+
+def _of_levels(source: Corpus, levels: Sequence[int] | None) -> Design:
+    design = source.plan.base
+    if design.camera.colour != "mono":
+        raise DesignError("camera.colour", shown(design.camera.colour), '"mono"', source=source.name)
+    if levels is None:
+        return design
+    for level in levels:
+        if level not in range(source.levels):
+            allowed = f"some of 0 to {source.levels - 1}"
+            raise DesignError("levels", shown(level), allowed, source=source.name)
+    depths = tuple(design.press.indentation_mm[level] for level in levels)
+    return replace(design, press=replace(design.press, indentation_mm=depths))
+
+
+def _level_names(values: dict[str, float], levels: Sequence[int]) -> dict[str, float]:
+    """Values with the press depths of these levels only, under their new numbers."""
+    start = "press.indentation_mm."
+    found = {name: value for name, value in values.items() if not name.startswith(start)}
+    return found | {
+        f"{start}{new}": values[f"{start}{old}"]
+        for new, old in enumerate(levels)
+        if f"{start}{old}" in values
+    }
+
+
+def _range(plan: Any, name: str) -> tuple[float, float]:
+    values = plan.columns[name][~plan.columns["blank"]]
+    from twin.study import parse_study
+
+    group = next(one for one in parse_study(plan.head.study).samples if one.inclusion is not None)
+    assert group.inclusion is not None
+    low, high = group.inclusion.span(name)
+    return (low, high) if high > low else (float(values.min()) - 1e-3, float(values.max()) + 1e-3)
+
+
+def gather(source: Corpus, emulator: fem.Emulator, parts: Path, tell: Callable[[float], None]) -> Seen:
+    """Return a corpus's samples; what was read before is kept in the folder ``parts``."""
+    plan, base = source.plan, source.plan.base
+    kept = parts / f"pictures-{plan.head.samples.sha256[:16]}.npz"
+    old: dict[int, tuple[Single, Single]] = {}
+    if kept.is_file():
+        with np.load(kept, allow_pickle=False) as file:
+            old = {
+                int(n): (x, y)
+                for n, x, y in zip(file["numbers"], file["contacts"], file["charges"], strict=True)
+            }
+    found = []
+    for count, number in enumerate(source.samples):
+        number = int(number)
+        if number not in old:
+            values = {k: v for k, v in plan.parameters(number).items() if v is not None}
+            blank = plan.inclusion(number) is None
+            old[number] = (
+                contacts(base, emulator, [values], [blank])[0],
+                np.stack([_charges(source, number, level) for level in range(source.levels)]),
+            )
+            if count % 100 == 99:
+                _keep(kept, old)
+        found.append(old[number])
+        tell((count + 1) / len(source.samples))
+    _keep(kept, old)
+    return Seen(
+        np.asarray(source.samples),
+        [{k: v for k, v in plan.parameters(int(n)).items() if v is not None} for n in source.samples],
+        np.array([plan.inclusion(int(n)) is None for n in source.samples]),
+        np.stack([one[0] for one in found]),
+        np.stack([one[1] for one in found]),
+    )
+
+
+def _keep(place: Path, samples: dict[int, tuple[Single, Single]]) -> None:
+    part = place.with_name(f".{place.name}.{os.getpid()}.part.npz")
+    np.savez(
+        part,
+        allow_pickle=False,
+        numbers=np.array(list(samples)),
+        contacts=np.stack([one[0] for one in samples.values()]),
+        charges=np.stack([one[1] for one in samples.values()]),
+    )
+    os.replace(part, place)
+
+
+def _charges(source: Corpus, number: int, level: int) -> Single:
+    design = source.design_of(number)
+    flux = np.array([led.flux_W for led in design.leds], np.float32)[:, None, None]
+    both = (source.layers(number, level), source.reference_layers(number, level))
+    rows, columns = (side // block * block for side, block in zip(source.shape, BLOCK, strict=True))
+    return np.stack([retake.charges(design, layers[:, :rows, :columns], BLOCK) / flux for layers in both])
+
+
+def learn_light(design: Design, emulator: fem.Emulator, seen: Seen) -> tuple[Chain, Single]:
+    """Return the chain, and its errors of pictures left out, (n, levels, 2, r, c) counts of all LEDs."""
+    n, levels = seen.contacts.shape[:2]
+    light, left = light_map.learn(
+        seen.contacts.reshape(n * levels * 2, -1),
+        seen.charges.reshape(n * levels * 2, *seen.charges.shape[3:]),
+        np.repeat(np.arange(n), levels * 2),
+    )
+    chain = Chain(design, emulator, light)
+    bright = Brightness.of(chain, seen.values)
+    errors = np.einsum(
+        "nlpiyx,ni->nlpyx",
+        left.reshape(seen.charges.shape),
+        bright.flux_W / bright.gain[:, None],
+        optimize=True,
+    )
+    return chain, np.asarray(errors, np.float32)
+
+
+def features_of(chain: Chain, inputs: Single, values: Sequence[dict[str, float]]) -> Features:
+    """Return the features of pictures of these specimens."""
+    bright = Brightness.of(chain, values)
+    seen = pictures(chain, inputs, bright)
+    variance = noise_variance(chain.design, seen, bright.gain).mean(axis=(0, 3, 4))
+    reference = variance[:, 1] / REFERENCE_FRAMES
+    return compress(seen, np.sqrt(np.stack([variance[:, 0] + reference, reference], axis=1)))
+
+
+def likeness_of(
+    chain: Chain,
+    features: Features,
+    inputs: Single,
+    values: Sequence[dict[str, float]],
+    errors: Single,
+    seed: int,
+) -> dict[str, NDArray[Any]]:
+    """Return what `novelty.score` needs: noisy pictures, half of them seen by a camera that stands off."""
+    rng = np.random.default_rng([seed, 3])
+    bright = Brightness.of(chain, values)
+    seen = pictures(chain, inputs, bright)
+    empty = rng.random(len(seen)) < 0.2
+    seen[empty, :, 0] = seen[empty, :, 1]
+    spread = np.sqrt(noise_variance(chain.design, seen, bright.gain))
+    frames = np.exp(rng.uniform(0.0, np.log(MOST_FRAMES), len(seen)))
+    scale = np.stack([frames, np.maximum(frames, REFERENCE_FRAMES)], axis=1)[:, None, :, None, None]
+    noisy = seen + spread * rng.standard_normal(seen.shape) / np.sqrt(scale)
+    noisy += errors[rng.integers(len(errors), size=len(seen))]
+    n = len(seen) // 2
+    off = noisy[n::2]
+    noisy[n::2] = novelty.misaligned(off.reshape(len(off), -1, *off.shape[-2:]), rng).reshape(off.shape)
+    stacked = features.stacked(noisy)
+    return dict(novelty.fit(stacked[:n], stacked[n:]))
+
+
+def _network(told: Simulated, place: Path, minutes: float, seed: int, tell: Progress) -> Any:
+    """Train the network, from where it was left."""
+    training = Training.begin(told, seed)
+    best = {name: value.clone() for name, value in training.network.state_dict().items()}
+    memory = place.with_suffix(".json")
+    spent = 0.0
+    if place.is_file() and memory.is_file():
+        state, said = safetensors.torch.load_file(place), json.loads(memory.read_bytes())
+        if said.get("sha256") == hashlib.sha256(place.read_bytes()).hexdigest():
+            training.restore(state, said)
+            best = {n.removeprefix("best."): v for n, v in state.items() if n.startswith("best.")}
+            spent = float(said["seconds"])
+    began = time.monotonic()
+
+    def keep(state: dict[str, torch.Tensor]) -> None:
+        arrays = {**training.state(), **{f"best.{name}": value for name, value in state.items()}}
+        data = safetensors.torch.save({name: value.contiguous() for name, value in arrays.items()})
+        said = {
+            "step": training.step,
+            "best": training.best,
+            "seconds": spent + time.monotonic() - began,
+            "sha256": hashlib.sha256(data).hexdigest(),
+        }
+        for path, text in ((place, data), (memory, json.dumps(said).encode())):
+            part = path.with_name(f".{path.name}.{os.getpid()}.part")
+            part.write_bytes(text)
+            os.replace(part, path)
+
+    def on(step: int, loss: float) -> None:
+        share = max(step / _STEPS, (spent + time.monotonic() - began) / (60.0 * minutes))
+        tell("network", 0.5 + 0.4 * min(share, 1.0))
+
+    best = train_network(
+        training,
+        told,
+        steps=_STEPS,
+        seed=seed,
+        until=began + 60.0 * minutes - spent,
+        best=best,
+        tell=on,
+        keep=keep,
+    )
+    return restored(training.network.size, best)
