@@ -8,13 +8,13 @@ from twin.arguments import add_verb, number, whole
 
 _TRAIN = """\
 Learn from a corpus to tell an inclusion's size, depth and modulus from pictures, with how sure that is, and
-whether there is one at all. Writes MODEL and, beside it, a card (NAME.json) of what it was trained for and of
-how well it does on samples that it has not seen. What is done is kept beside them: the same command goes on
-with it, also after Ctrl-C.
+whether there is one at all. Writes MODEL.safetensors and MODEL.json, a card of what it was trained for and of
+how well it does on samples that it has not seen (those of a group named test). What is done is kept beside
+them, in MODEL.parts: the same command goes on with it, also after Ctrl-C.
 
 examples:
-  twin train corpora/train --out models/tsis.safetensors
-  twin train corpora/train --levels 0 2 --minutes 40 --seed 1 --out models/two-levels.safetensors
+  twin train corpora/train --out models/tsis
+  twin train corpora/train --levels 0 2 --minutes 40 --seed 1 --out models/two-levels
 """
 
 _ESTIMATE = """\
@@ -39,7 +39,7 @@ def add(verbs: Any) -> None:
     """Add both verbs to the parser of `twin.arguments`."""
     train = add_verb(verbs, "train", "learn to estimate inclusions from the pictures of a corpus", _TRAIN)
     train.add_argument("corpus", metavar="CORPUS", help="folder of a finished corpus")
-    train.add_argument("--out", metavar="MODEL", help="model to write, FILE.safetensors")
+    train.add_argument("--out", metavar="MODEL", help="model to write, without its ending")
     train.add_argument(
         "--levels", type=whole, nargs="+", metavar="N", help="press levels to use, from 0 (default: all)"
     )
@@ -49,7 +49,7 @@ def add(verbs: Any) -> None:
     train.add_argument("--seed", type=whole, default=0, metavar="N", help="of all random numbers (default 0)")
 
     estimate = add_verb(verbs, "estimate", "an inclusion from pictures, with how sure that is", _ESTIMATE)
-    estimate.add_argument("model", metavar="MODEL", help="what twin train wrote")
+    estimate.add_argument("model", metavar="MODEL", help="what twin train wrote, FILE.safetensors")
     estimate.add_argument("frames", metavar="FRAME", nargs="+", help="folder of twin simulate, or PNG file")
     estimate.add_argument(
         "--reference", metavar="FILE", nargs="+", default=[], help="PNG files of the press without inclusion"

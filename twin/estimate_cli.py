@@ -15,7 +15,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _train(arguments: argparse.Namespace) -> int:
     if arguments.out is None:
-        raise DesignError("--out", "nothing", "the model to write, such as models/tsis.safetensors")
+        raise DesignError("--out", "nothing", "the model to write, such as models/tsis")
     levels = arguments.levels
     if levels is not None and len(set(levels)) < len(levels):
         raise DesignError("--levels", shown(levels), "each press level once")
@@ -25,7 +25,7 @@ def _train(arguments: argparse.Namespace) -> int:
     with Reporter() as report:
         written = train(
             arguments.corpus,
-            arguments.out,
+            arguments.out.removesuffix(".safetensors"),
             levels=levels,
             minutes=arguments.minutes,
             seed=arguments.seed,
