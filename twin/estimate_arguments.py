@@ -25,7 +25,8 @@ trained for, are refused in one line. With --out: estimate.json, and overview.pn
 FRAME is a folder of `twin simulate` (one press level or all), or a camera's PNG file of 8 or 16 bits, one for
 each of the model's press levels in order; these need --reference: the same presses without inclusion, in the
 same order. A camera below the sensor sees the mirror image, which --flip turns round. With --frames N each
-level has N exposures, those of the first level first; references may be several for each level, too.
+level has N exposures, those of the first level first; references may be several for each level, too. Give
+exposures as they were taken: a mean that was rounded to whole counts is biased where it is dark.
 
 examples:
   twin simulate tsis --size 10 --depth 5 --modulus 100 --indentation 1 2 3 --out levels
