@@ -70,7 +70,7 @@ def card_of(design: Design, levels: tuple[float, ...]) -> dict[str, Any]:
         "colour": camera.colour,
         "indentation_mm": list(levels),
         "frames": [1, 100],
-        "ranges": RANGES,
+        "ranges": {name: list(ends) for name, ends in RANGES.items()},
         "refuse_below": 0.01,
     }
 

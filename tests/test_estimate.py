@@ -14,7 +14,7 @@ from stand_in import RANGES, StandIn, as_module, card_of
 from twin import cli
 from twin.estimate import estimate, told
 from twin.estimate_pictures import Sheet, overview
-from twin.estimates import NAMES, probability
+from twin.estimates import NAMES, decimals, probability
 
 
 def size_of(place):
@@ -77,6 +77,7 @@ def test_what_is_said_of_what_is_not_known(use, frames):
     assert "these pictures hardly tell" in lines[3] and "40 to 120" in lines[3]
     assert "hardly" not in lines[2]
     assert (probability(0.9999), probability(0.5)) == ("> 0.999", "0.500")
+    assert [decimals(sd) for sd in (18.0, 1.2, 0.2, 0.04, 0.0)] == [0, 1, 2, 3, 3]
 
 
 def test_the_same_estimate_gives_the_same_picture(use, tmp_path):

@@ -11,7 +11,7 @@ from painted_press import painted_light, small
 
 from scenes.camera import expose, mean_counts
 from twin.complaint import DesignError
-from twin.likeness import learn, likeness
+from twin.likeness import fits, learn, likeness
 from twin.received import Received
 from twin.sound import check_exposure, check_pair, coarse
 
@@ -92,6 +92,12 @@ def test_a_hundred_aliens_are_refused(stored):
     assert families.total() == 100 and len(families) == 14
     assert refused.total() >= 95, families - refused
     assert all(2 * refused[family] > families[family] for family in families)
+
+
+def test_arrays_of_another_shape_are_seen(stored):
+    shape = (2, *stored["scale_tared"].shape[1:])
+    assert fits(stored, shape) and not fits(stored, (3, *shape[1:])) and not fits({}, shape)
+    assert not any(fits({**stored, name: stored[name][:0]}, shape) for name in stored)
 
 
 def test_why_is_said(stored):

@@ -270,6 +270,10 @@ def test_a_card_says_what_is_wanted():
     card = {"shape": [48, 64], "bits": 8, "colour": "mono", "indentation_mm": [1, 2, 3], "frames": [1, 100]}
     assert wanted_of(json.loads(json.dumps(card))) == wanted(SENSOR)
     assert wanted_of({**card, "colour": "rgb"}).planes == (48, 64, 3)
+    wrong = {"shape": [48, 64.0], "bits": True, "colour": None, "indentation_mm": [1, "2"], "frames": [5, 1]}
+    for name, value in wrong.items():
+        with pytest.raises(DesignError, match=f"card of the model: {name}: received"):
+            wanted_of({**card, name: value})
 
 
 def test_grey_pictures_for_a_camera_of_colour(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 from twin import interrupt
 from twin.complaint import DesignError, shown
 from twin.design import Design, parse_design
-from twin.estimates import Estimate, probability
+from twin.estimates import NAMES, Estimate, decimals, probability
 from twin.frame import versions
 from twin.received import Received, wanted_of
 from twin.receiving import receive
@@ -21,7 +22,7 @@ RECORD, PICTURE = "estimate.json", "overview.png"
 
 _UNKNOWN = 0.8
 """Width of a 90 % interval over that of 90 % of the range, above which the pictures tell nothing."""
-_WORDS = {"size_mm": ("size", "mm", 1), "depth_mm": ("depth", "mm", 1), "modulus_kPa": ("modulus", "kPa", 0)}
+_WORDS = {"size_mm": ("size", "mm"), "depth_mm": ("depth", "mm"), "modulus_kPa": ("modulus", "kPa")}
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,8 +42,14 @@ class Found:
 
     @property
     def ranges(self) -> Mapping[str, Sequence[float]]:
-        """Of each parameter, as trained."""
-        ranges: Mapping[str, Sequence[float]] = self.card["ranges"]
+        """Of each parameter, as trained. Raises `DesignError` where the card does not tell them."""
+        ranges = self.card["ranges"]
+        for name in NAMES:
+            given = ranges.get(name)
+            numbers = isinstance(given, list) and [type(end) in (int, float) for end in given] == [True, True]
+            if not numbers or not -math.inf < given[0] < given[1] < math.inf:
+                allowed = "lowest and highest value"
+                raise DesignError(f"ranges.{name}", shown(given), allowed, source="card of the model")
         return ranges
 
 
@@ -102,7 +109,9 @@ def _estimate(
     if answer.refused is not None:
         allowed = "pictures like those that the model was trained for"
         raise DesignError(_several(received.names), answer.refused, allowed)
-    return Found(answer, received, estimator.card, str(model), seed)
+    found = Found(answer, received, estimator.card, str(model), seed)
+    _ = found.ranges  # a card without them is refused before anything is said
+    return found
 
 
 def holds_estimate(folder: Path) -> bool:
@@ -165,7 +174,8 @@ def told(found: Found) -> str:
     chance = f"probability of an inclusion: {probability(answer.presence)}"
     lines = [chance if answer.presence >= 0.5 else f"{chance}; if there is one:"]
     for index, name in enumerate(answer.names):
-        word, unit, digits = _WORDS[name]
+        word, unit = _WORDS[name]
+        digits = decimals(answer.covariance[index, index] ** 0.5)
         below, above = answer.interval[index]
         span = f"{below:.{digits}f} to {above:.{digits}f}"
         line = f"  {word:<8} {answer.mean[index]:6.{digits}f} {unit:<4} 90 %: {span}"

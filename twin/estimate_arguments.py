@@ -9,8 +9,8 @@ from twin.arguments import add_verb, number, whole
 _TRAIN = """\
 Learn from a corpus to tell an inclusion's size, depth and modulus from pictures, with how sure that is, and
 whether there is one at all. Writes MODEL.safetensors and MODEL.json, a card of what it was trained for and of
-how well it does on samples that it has not seen. What is done is kept beside them: the same command goes on
-with it, also after Ctrl-C.
+how well it does on samples that it has not seen (those of a group named test). What is done is kept beside
+them, in MODEL.parts: the same command goes on with it, also after Ctrl-C.
 
 examples:
   twin train corpora/train --out models/tsis
@@ -25,13 +25,14 @@ trained for, are refused in one line. With --out: estimate.json, and overview.pn
 FRAME is a folder of `twin simulate` (one press level or all), or a camera's PNG file of 8 or 16 bits, one for
 each of the model's press levels in order; these need --reference: the same presses without inclusion, in the
 same order. A camera below the sensor sees the mirror image, which --flip turns round. With --frames N each
-level has N exposures, those of the first level first; references may be several for each level, too.
+level has N exposures, those of the first level first; references may be several for each level, too. Give
+exposures as they were taken: a mean that was rounded to whole counts is biased where it is dark.
 
 examples:
   twin simulate tsis --size 10 --depth 5 --modulus 100 --indentation 1 2 3 --out levels
-  twin estimate models/tsis levels --out estimate
-  twin estimate models/tsis 1mm.png 2mm.png 3mm.png --reference r1.png r2.png r3.png --flip --out estimate
-  twin estimate models/tsis 1mm-*.png 2mm-*.png 3mm-*.png --frames 10 --reference r?mm-*.png --flip
+  twin estimate tsis.safetensors levels --out estimate
+  twin estimate tsis.safetensors 1mm.png 2mm.png 3mm.png --reference r1.png r2.png r3.png --flip --out found
+  twin estimate tsis.safetensors 1mm-*.png 2mm-*.png 3mm-*.png --frames 10 --reference r?mm-*.png --flip
 """
 
 
@@ -49,7 +50,7 @@ def add(verbs: Any) -> None:
     train.add_argument("--seed", type=whole, default=0, metavar="N", help="of all random numbers (default 0)")
 
     estimate = add_verb(verbs, "estimate", "an inclusion from pictures, with how sure that is", _ESTIMATE)
-    estimate.add_argument("model", metavar="MODEL", help="what twin train wrote")
+    estimate.add_argument("model", metavar="MODEL", help="what twin train wrote, FILE.safetensors")
     estimate.add_argument("frames", metavar="FRAME", nargs="+", help="folder of twin simulate, or PNG file")
     estimate.add_argument(
         "--reference", metavar="FILE", nargs="+", default=[], help="PNG files of the press without inclusion"

@@ -25,7 +25,7 @@ def _train(arguments: argparse.Namespace) -> int:
     with Reporter() as report:
         written = train(
             arguments.corpus,
-            arguments.out,
+            arguments.out.removesuffix(".safetensors"),
             levels=levels,
             minutes=arguments.minutes,
             seed=arguments.seed,

@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from scenes.exr import write_bytes
-from twin.estimates import Estimate, probability
+from twin.estimates import Estimate, decimals, probability
 from twin.frame import grey
 from twin.panels import FAINT, INK, scale_bar
 from twin.pictures import DPI, HEIGHT_PX, STYLE, WIDTH_PX
@@ -100,11 +100,12 @@ def _draw(figure: Figure, sheet: Sheet) -> None:
 
 
 def _headline(estimate: Estimate) -> str:
-    (size, depth, modulus), sd = estimate.mean, np.sqrt(np.diag(estimate.covariance))
-    what = (
-        f"{size:.1f} ± {sd[0]:.1f} mm wide, top {depth:.1f} ± {sd[1]:.1f} mm deep, "
-        f"{modulus:.0f} ± {sd[2]:.0f} kPa"
+    sd = np.sqrt(np.diag(estimate.covariance))
+    size, depth, modulus = (
+        f"{value:.{decimals(apart)}f} ± {apart:.{decimals(apart)}f}"
+        for value, apart in zip(estimate.mean, sd, strict=True)
     )
+    what = f"{size} mm wide, top {depth} mm deep, {modulus} kPa"
     if estimate.presence >= 0.5:
         return f"Inclusion, {what}"
     return f"Probably no inclusion; if there is one, {what}"
@@ -166,7 +167,7 @@ def _bar_below(axes: Axes, drawn: Any, label: str, extend: str = "neither") -> N
     bar = axes.figure.colorbar(drawn, cax=below, orientation="horizontal", extend=extend)
     bar.outline.set_linewidth(0.5)
     bar.set_label(label, fontsize=6.5, labelpad=1)
-    bar.locator = MaxNLocator(5)
+    bar.locator = MaxNLocator(5, prune="both")
     bar.update_ticks()
     below.tick_params(labelsize=6.5, length=2, pad=1)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,3 +47,8 @@ class Estimate:
 def probability(value: float) -> str:
     """Return a probability in three figures, never as a certainty that no posterior has."""
     return "> 0.999" if value > 0.9995 else "< 0.001" if value < 0.0005 else f"{value:.3f}"
+
+
+def decimals(sd: float) -> int:
+    """Return how many decimals give two figures of a standard deviation, 0 to 3."""
+    return 3 if sd <= 1e-3 else min(max(1 - math.floor(math.log10(sd)), 0), 3)

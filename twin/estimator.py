@@ -22,10 +22,10 @@ import torch
 from numpy.typing import NDArray
 
 import fem
-from estimation import novelty
 from estimation.features import Features
 from estimation.light_map import LightMap
 from estimation.posterior import MOST_FRAMES, REFERENCE_FRAMES, Posterior, restored
+from twin import likeness
 from twin.chain import BLOCK, Chain
 from twin.complaint import DesignError, shown
 from twin.design import parse_design
@@ -68,6 +68,7 @@ class Estimator:
     error: NDArray[np.float64]
     """(k, k) covariance of the features' errors of the chain."""
     novelty: Mapping[str, NDArray[Any]]
+    """What `twin.likeness.learn` gave."""
 
     def estimate(self, received: Received, *, samples: int = 4000, seed: int = 0) -> Estimate:
         """Return what is known after the pictures; ``samples`` of the posterior are drawn from ``seed``."""
@@ -76,15 +77,15 @@ class Estimator:
         drawn = self.unscaled(self.network.sample(told, frames, samples, seed)[0])
         fitted = self.fitted(seen, frames, drawn.mean(axis=0))
         wanted = drawn[:, : len(NAMES)]
-        likeness = float(novelty.score(self.novelty, self.features.stacked(seen[None]))[0])
+        counts = seen + black(self.chain)
+        like, strangest = likeness.likeness(self.novelty, counts[:, 0], counts[:, 1])
         gain = np.array([self.chain.gain(self.prior.values(fitted.x))])
         variance = noise_variance(self.chain.design, seen[None], gain)[0] / np.array(
             [frames, max(frames, REFERENCE_FRAMES)]
         ).reshape(2, 1, 1)
         reason = None
-        if likeness < self.card["refuse_below"]:
-            share = 100 * (1 - self.card["refuse_below"])
-            reason = f"pictures less like this sensor's than {share:g} % of its own"
+        if like < self.card["refuse_below"]:
+            reason = f"pictures unlike this sensor's: {strangest}"
         return Estimate(
             NAMES,
             wanted,
@@ -92,7 +93,7 @@ class Estimator:
             np.cov(wanted.T),
             np.percentile(wanted, [5.0, 95.0], axis=0).T,
             float(self.network.present(told, frames)[0]),
-            likeness,
+            like,
             reason,
             np.asarray(seen[:, 0] - seen[:, 1], np.float64),
             np.asarray(fitted.pictures[:, 0] - fitted.pictures[:, 1], np.float64),
@@ -278,4 +279,6 @@ def _assembled(card: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Estimat
     strange = {
         name.removeprefix("novelty."): value for name, value in arrays.items() if name.startswith("novelty.")
     }
+    if not likeness.fits(strange, (features.shape[0], *features.shape[2:])):
+        raise ValueError("novelty")
     return Estimator(card, Chain(design, emulator, light), features, network, prior, arrays["error"], strange)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimation.features import Features
+from fem.sampling import clearance
 from twin.chain import Chain
 from twin.imagined import Brightness, noise_variance, pictures
 from twin.study import PARAMETERS
@@ -93,7 +94,7 @@ class Fitted:
 
 def expected(chain: Chain, prior: Prior, many: Sequence[Floats]) -> NDArray[np.float32]:
     """Return expected counts above black (n, levels, 2, r, c) at unknowns (5 + q,) each."""
-    values = [prior.values(x) for x in many]
+    values = [_reachable(chain, prior.values(x)) for x in many]
     contact = [tuple(v for k, v in one.items() if not _bright(k)) for one in values]
     first: dict[tuple[float, ...], int] = {}
     for key in contact:
@@ -101,6 +102,25 @@ def expected(chain: Chain, prior: Prior, many: Sequence[Floats]) -> NDArray[np.f
     chosen = [values[contact.index(key)] for key in first]
     inputs = chain.inputs(chosen)[[first[key] for key in contact]]
     return pictures(chain, inputs, Brightness.of(chain, values))
+
+
+def _reachable(chain: Chain, values: dict[str, float]) -> dict[str, float]:
+    """Values within the emulator's ranges: strange pictures may ask for a press that it cannot tell."""
+    ranges, tissue = chain.emulator.plan.ranges, chain.design.specimen
+    spans = {"specimen.thickness_mm": ranges.thickness_mm, "specimen.modulus_kPa": ranges.tissue_kPa}
+    found = {
+        name: float(
+            np.clip(
+                value,
+                *(ranges.indentation_mm if name.startswith("press.") else spans.get(name, (-np.inf, np.inf))),
+            )
+        )
+        for name, value in values.items()
+    }
+    thickness = found.get("specimen.thickness_mm", tissue.thickness_mm)
+    room = clearance(found["size_mm"], found["depth_mm"], thickness)
+    found["depth_mm"] += min(room, 0.0)
+    return found
 
 
 def _bright(name: str) -> bool:

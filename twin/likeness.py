@@ -75,6 +75,23 @@ def likeness(
     return float(novelty.score(stored, features)[0]), f"{times} times as far as usual from {_WAYS[way]}"
 
 
+def fits(stored: Mapping[str, NDArray[np.floating]], shape: tuple[int, int, int]) -> bool:
+    """Return whether arrays from a file are what `learn` gives for pictures (levels, rows, columns)."""
+    length, sizes = 2 * int(np.prod(shape)), {name: array.shape for name, array in stored.items()}
+    k, ranks = len(stored.get("spread", ())), len(stored.get("smallest", ()))
+    wanted = {
+        "scale_tared": shape,
+        "scale_reference": shape,
+        "mean": (length,),
+        "components": (k, length),
+        "spread": (k,),
+        "tolerance": (1,),
+        "ranks": (ranks, 2),
+        "smallest": (ranks,),
+    }
+    return sizes == wanted and ranks > 0 and all(stored[name].min() > 0 for name in list(wanted)[:2])
+
+
 def _scales(plain: Float, camera: Camera, block: int) -> dict[str, Float]:
     """Standard deviations that make features of tared pictures and references, (levels, rows, columns)."""
     mean = plain.mean(axis=0)

@@ -11,7 +11,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
-from twin.estimates import Estimate
+from twin.estimates import Estimate, decimals
 from twin.panels import FAINT, INK
 
 BLUE, MIDDLE, PALE, GREY = "#2b6ca3", "#8db3d3", "#d6e4f0", "#bbbbbb"
@@ -84,7 +84,7 @@ def _single(
     axes.axvline(estimate.mean[index], color=BLUE, lw=0.8)
     axes.set_ylim(0, 1.1 * max(float(density.max()), even))
     axes.set_yticks([])
-    name, digits = estimate.names[index], 0 if given[1] - given[0] > 30 else 1
+    name, digits = estimate.names[index], decimals(float(np.sqrt(estimate.covariance[index, index])))
     numbers = [f"{value:.{digits}f}" for value in (estimate.mean[index], below, above)]
     text = f"{LABELS.get(name, name)}\n{numbers[0]}  ({numbers[1]} to {numbers[2]})"
     axes.set_title(text, fontsize=7, fontweight="normal", pad=13)

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from twin.complaint import DesignError, shown
+
+MAX_SIDE = 16384  # pixels, as a camera may have
+MAX_FRAMES = 10_000  # exposures, as a camera may average
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,8 +69,36 @@ class Wanted:
 
 
 def wanted_of(card: Mapping[str, Any]) -> Wanted:
-    """Return what the card of a model says of its pictures."""
-    rows, columns = card["shape"]
-    least, most = card["frames"]
-    levels = tuple(float(depth) for depth in card["indentation_mm"])
-    return Wanted((int(rows), int(columns)), int(card["bits"]), card["colour"], levels, (least, most))
+    """Return what the card of a model says of its pictures. Raises `DesignError` for what it cannot say."""
+
+    def refuse(name: str, allowed: str) -> DesignError:
+        return DesignError(name, shown(card.get(name)), allowed, source="card of the model")
+
+    shape: Any = card.get("shape")
+    frames: Any = card.get("frames")
+    depths: Any = card.get("indentation_mm")
+    if not _whole(shape, 2, 1, MAX_SIDE):
+        raise refuse("shape", "rows and columns")
+    if not _whole(frames, 2, 1, MAX_FRAMES) or frames[0] > frames[1]:
+        raise refuse("frames", "fewest and most exposures")
+    if not _whole([card.get("bits")], 1, 1, 16):
+        raise refuse("bits", "1 to 16")
+    if card.get("colour") not in ("mono", "rgb"):
+        raise refuse("colour", "mono or rgb")
+    if not isinstance(depths, list) or not depths or not all(_depth(depth) for depth in depths):
+        raise refuse("indentation_mm", "a list of numbers > 0")
+    rows, columns = shape
+    return Wanted((rows, columns), card["bits"], card["colour"], tuple(map(float, depths)), tuple(frames))
+
+
+def _whole(values: Any, count: int, low: int, high: int) -> bool:
+    """Whether this is a list of so many whole numbers in a range."""
+    return (
+        isinstance(values, list)
+        and len(values) == count
+        and all(type(value) is int and low <= value <= high for value in values)
+    )
+
+
+def _depth(value: Any) -> bool:
+    return type(value) in (int, float) and 0 < value < math.inf

@@ -21,15 +21,13 @@ from scenes import exr
 from twin.complaint import DesignError, shown
 from twin.exposure import REFERENCE_FRAMES
 from twin.frame import MEAN, RECORD
-from twin.received import Received, Wanted
+from twin.received import MAX_FRAMES, Received, Wanted
 from twin.sound import check_exposure, check_pair, check_same
 
 Float = NDArray[np.float32]
 
-_OFF = 0.1
-"""Share of a press level that a simulated frame's may be off."""
-_MOST_FRAMES = 10_000
-"""As a camera may average."""
+_OFF = 0.03
+"""Share of a press level that a simulated frame's may be off: no more than an estimator allows for."""
 _MOST_RECORD = 2**20  # bytes
 _SIMULATED = "folder of twin simulate"
 
@@ -83,8 +81,8 @@ def _from_camera(
         allowed = f"pictures of the press without inclusion, as many for each of {levels}"
         raise DesignError("--reference", f"{len(references) or 'no'} files", allowed)
     several = len(references) // wanted.levels
-    if several > _MOST_FRAMES:
-        raise DesignError("--reference", f"{several} a level", f"at most {_MOST_FRAMES}")
+    if several > MAX_FRAMES:
+        raise DesignError("--reference", f"{several} a level", f"at most {MAX_FRAMES}")
     _check_frames(exposures, wanted)
     twice = {os.path.abspath(place) for place in references} & {os.path.abspath(place) for place in files}
     if twice:
@@ -277,8 +275,8 @@ def _number(record: dict[str, Any], table: str, name: str, folder: Path) -> floa
 def _count(record: dict[str, Any], name: str, default: int | None, folder: Path) -> int:
     inner = record.get("tsis")
     value = inner.get(name, default) if isinstance(inner, dict) else default
-    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= _MOST_FRAMES:
-        allowed = f"an integer of 1 to {_MOST_FRAMES}"
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= MAX_FRAMES:
+        allowed = f"an integer of 1 to {MAX_FRAMES}"
         raise DesignError(f"{folder / RECORD}: tsis.{name}", shown(value), allowed)
     return value
 

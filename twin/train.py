@@ -23,16 +23,16 @@ import torch
 from numpy.typing import NDArray
 
 import fem
-from estimation import light_map, novelty
+from estimation import light_map
 from estimation.features import Features, compress
 from estimation.posterior import MOST_FRAMES, REFERENCE_FRAMES, Simulated, Training, restored
 from estimation.posterior import train as train_network
-from twin import assess, retake
+from twin import assess, likeness, retake
 from twin.chain import BLOCK, Chain, contacts
 from twin.complaint import DesignError, shown
 from twin.corpus import Corpus
 from twin.design import Design
-from twin.estimator import Estimator, save_estimator
+from twin.estimator import Estimator, black, save_estimator
 from twin.fields import tables_of
 from twin.fitting import prior_of
 from twin.frame import versions
@@ -47,7 +47,8 @@ IMAGINED = 16_000
 _LEAST = 30  # samples that a light map is learned from
 _SHOWN = 2500  # specimens that features are found from
 _STEPS = 12_000
-REFUSE_BELOW = 0.01
+_LIKE = 600  # specimens that likeness is learned from
+REFUSE_BELOW = 0.005
 
 
 @dataclass(frozen=True)
@@ -164,7 +165,7 @@ def train(
         network,
         prior_of(ranges, many),
         np.asarray(error.T @ error / max(len(error), 1), np.float64),
-        likeness_of(chain, features, inputs[:_SHOWN], many[:_SHOWN], errors, seed),
+        likeness_of(chain, inputs[:_LIKE], many[:_LIKE], errors, seed),
     )
     metrics: dict[str, Any] = {}
     if len(testing.numbers):
@@ -295,29 +296,13 @@ def features_of(chain: Chain, inputs: Single, values: Sequence[dict[str, float]]
 
 
 def likeness_of(
-    chain: Chain,
-    features: Features,
-    inputs: Single,
-    values: Sequence[dict[str, float]],
-    errors: Single,
-    seed: int,
+    chain: Chain, inputs: Single, values: Sequence[dict[str, float]], errors: Single, seed: int
 ) -> dict[str, NDArray[Any]]:
-    """Return what `novelty.score` needs: noisy pictures, half of them seen by a camera that stands off."""
+    """Return what `likeness.likeness` needs, of pictures with the light map's errors in them."""
     rng = np.random.default_rng([seed, 3])
-    bright = Brightness.of(chain, values)
-    seen = pictures(chain, inputs, bright)
-    empty = rng.random(len(seen)) < 0.2
-    seen[empty, :, 0] = seen[empty, :, 1]
-    spread = np.sqrt(noise_variance(chain.design, seen, bright.gain))
-    frames = np.exp(rng.uniform(0.0, np.log(MOST_FRAMES), len(seen)))
-    scale = np.stack([frames, np.maximum(frames, REFERENCE_FRAMES)], axis=1)[:, None, :, None, None]
-    noisy = seen + spread * rng.standard_normal(seen.shape) / np.sqrt(scale)
-    noisy += errors[rng.integers(len(errors), size=len(seen))]
-    n = len(seen) // 2
-    off = noisy[n::2]
-    noisy[n::2] = novelty.misaligned(off.reshape(len(off), -1, *off.shape[-2:]), rng).reshape(off.shape)
-    stacked = features.stacked(noisy)
-    return dict(novelty.fit(stacked[:n], stacked[n:]))
+    seen = pictures(chain, inputs, Brightness.of(chain, values))
+    seen += errors[rng.integers(len(errors), size=len(seen))] + np.float32(black(chain))
+    return dict(likeness.learn(seen[:, :, 0], seen[:, :, 1], chain.design.camera, BLOCK[0], seed))
 
 
 def _network(told: Simulated, place: Path, minutes: float, seed: int, tell: Progress) -> Any:
