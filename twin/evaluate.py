@@ -123,9 +123,12 @@ class Bench:
     samples: int = 0
     _lighting: tuple[Any, Lighting] | None = None
 
-    def lighting(self, design: Design, quality: str, seed: int) -> Lighting:
-        """Return the light of a sensor on coarse pixels; what the camera makes of it does not count."""
-        key = optical_key(design), quality, seed, self.samples
+    def lighting(self, design: Design, quality: str, seed: int, plain: Any) -> Lighting:
+        """Return the light of a sensor on coarse pixels; what the camera makes of it does not count.
+
+        ``plain`` names the mechanics of plain tissue, whose pictures its presses share.
+        """
+        key = repr((optical_key(design), quality, seed, self.samples, plain))
         if self._lighting is None or self._lighting[0] != key:
             self._lighting = None  # its scene goes before the next one comes
             self._lighting = key, Lighting(design, quality, light_seed(seed), self.samples)
@@ -168,7 +171,7 @@ def evaluate(
     check(layout, inclusions)
     presses = [(place, level) for place in protocol.positions_mm for level in protocol.indentation_mm]
     seconds = {"mechanics": 0.0, "light": 0.0, "information": 0.0}
-    work = _Work(small, every, emulator, quality, seed, bench, seconds)
+    work = _Work(small, every, emulator, quality, seed, bench, seconds, inclusions[0])
     judged = []
     for number, inclusion in enumerate(inclusions):
         lit = []
@@ -252,12 +255,30 @@ class _Work:
     seed: int
     bench: Bench
     seconds: dict[str, float]
+    ground: fem.Inclusion
+    """Whose mesh carries the press on plain tissue, where presses are solved."""
 
     def __post_init__(self) -> None:
         self.moving = [unknown for unknown in self.unknowns if touches_contact(unknown.name)]
 
     def touch(self, inclusion: fem.Inclusion, level: float, place: tuple[float, float]) -> Touch:
-        """The contact, from before or computed now; a solved one serves at every level."""
+        """The contact, from before or computed now.
+
+        Every solve has its own mesh, whose error in the background would look like a signal: what the
+        inclusion adds on its mesh is added to the one background.
+        """
+        found = self._touch(inclusion, level, place)
+        if self.emulator is not None or (inclusion, place) == (self.ground, (0.0, 0.0)):
+            return found
+        ground = self._touch(self.ground, level, (0.0, 0.0))
+        slopes = {}
+        for name, slope in found.slopes.items():
+            plain = ground.slopes[name][1]
+            slopes[name] = np.stack([plain + (slope[0] - slope[1]), plain])
+        return Touch(ground.plain + (found.fields - found.plain), ground.plain, slopes, found.steps)
+
+    def _touch(self, inclusion: fem.Inclusion, level: float, place: tuple[float, float]) -> Touch:
+        """On its own mesh; a solved one serves at every level."""
         began = time.perf_counter()
         solved = self.emulator is None
         names = [unknown.name for unknown in self.moving]
@@ -297,7 +318,7 @@ class _Work:
 
     def standard(self, level: float, near: fem.Inclusion) -> tuple[NDArray[Any], NDArray[Any]]:
         """Radiance of plain tissue, and with the standard lump at each depth, at one level."""
-        size, modulus = objectives.STANDARD
+        size, modulus = objectives.PRESSED
 
         def make() -> Arrays:
             touch = self.touch(near, level, (0.0, 0.0))
@@ -321,17 +342,21 @@ class _Work:
 
     def depths(self) -> list[float]:
         """Depths at which the standard lump is pressed, within the slab."""
-        size, deepest = objectives.STANDARD[0], self.design.specimen.thickness_mm
-        return [depth for depth in objectives.STANDARD_DEPTHS_MM if depth + size < 0.9 * deepest]
+        size, deepest = objectives.PRESSED[0], self.design.specimen.thickness_mm
+        return [depth for depth in objectives.PRESSED_DEPTHS_MM if depth + size < 0.9 * deepest]
 
     def lump(self, ball: fem.Inclusion, level: float) -> NDArray[Any]:
         """Contact fields of an inclusion without any slopes."""
-        work = replace(self, unknowns=(), seconds=self.seconds)
-        return work.touch(ball, level, (0.0, 0.0)).fields
+        work = replace(self, unknowns=())
+        own = work._touch(ball, level, (0.0, 0.0))
+        if self.emulator is not None:
+            return own.fields
+        return self._touch(self.ground, level, (0.0, 0.0)).plain + (own.fields - own.plain)
 
     @property
     def lighting(self) -> Lighting:
-        return self.bench.lighting(self.design, self.quality, self.seed)
+        plain = self._key("plain", self.ground, 0.0, (0.0, 0.0))
+        return self.bench.lighting(self.design, self.quality, self.seed, plain)
 
     def _key(self, what: str, inclusion: fem.Inclusion, level: float, place: tuple[float, float]) -> Any:
         design = self.design
@@ -341,8 +366,8 @@ class _Work:
         return what, 1, bodies, felt, known, level, place, self.moving
 
     def _light_key(self, what: str, inclusion: fem.Inclusion, level: float, place: tuple[float, float]) -> Any:
-        own = optical_key(self.design), self.quality, self.seed, self.bench.samples, objectives.STANDARD
-        return self._key(what, inclusion, level, place), own, objectives.STANDARD_DEPTHS_MM
+        own = optical_key(self.design), self.quality, self.seed, self.bench.samples
+        return self._key(what, inclusion, level, place), own, self.ground
 
 
 def _judged(
@@ -426,7 +451,8 @@ def _detection(
         return 0.0
     plain, lumps = zip(*(work.standard(level, near) for level in protocol.indentation_mm), strict=True)
     began = time.perf_counter()
-    lit, reference = noises_of(design, block, protocol)
+    lit, reference = (_patchy(noise, work.bench.cell_mm) for noise in noises_of(design, block, protocol))
+    share = (objectives.STANDARD[0] / objectives.PRESSED[0]) ** 3
     kept = [k for k, unknown in enumerate(work.unknowns) if not touches.knows_inclusion(unknown.name)]
     prior = np.array([work.unknowns[k].sd for k in kept])
     means = [pixels.counted(design, one).mean for one in plain]
@@ -435,7 +461,14 @@ def _detection(
     found = []
     for number in range(len(depths)):
         lump = [pixels.counted(design, one[number]).mean for one in lumps]
+        lump = [base + share * (one - base) for base, one in zip(means, lump, strict=True)]
         pairs = [*means, *means], [*lump, *means], [lit] * len(means) + [reference] * len(means)
         found.append(objectives.deflection_of(*pairs, [*slopes, *slopes], prior))
     work.seconds["information"] += time.perf_counter() - began
-    return objectives.reach(depths, found, objectives.STANDARD[0])
+    middles = [depth + objectives.PRESSED[0] / 2 for depth in depths]
+    return objectives.reach(middles, found, objectives.STANDARD[0])
+
+
+def _patchy(noise: Any, cell_mm: float) -> Any:
+    """Patches as errors of single coarse pixels, which weigh as much together."""
+    return replace(noise, fixed_share=objectives.PATCHY * objectives.PATCH_MM / cell_mm)

@@ -52,11 +52,16 @@ OBJECTIVES: dict[str, Objective] = {
     )
 }
 
-STANDARD = (5.0, 100.0)
+STANDARD = (1.5, 100.0)
 """Diameter, mm, and modulus, kPa, of the lump that is looked for."""
-STANDARD_DEPTHS_MM = (4.0, 6.0, 8.0, 11.0)
+PRESSED = (4.0, 100.0)
+"""The one that is pressed in its stead, about the same middle: small lumps signal in proportion to d³."""
+PRESSED_DEPTHS_MM = (4.0, 6.0, 8.0, 11.0)
 FOUND = 3.29
 """Deflection d' at which it counts as found: the ideal observer's AUC is 0.99."""
+PATCHY, PATCH_MM = 0.003, 1.0
+"""What hides a lump beside noise: skin that gives a share of light more or less than it should, in patches
+of so many mm, other ones in every press; no averaging of frames takes it away."""
 
 
 def optical(design: Design, protocol: Protocol, judged: Sequence[Judged], block: float) -> dict[str, float]:
@@ -67,7 +72,7 @@ def optical(design: Design, protocol: Protocol, judged: Sequence[Judged], block:
     from twin.coarse import noise
 
     spread = noise(design, block, 1)
-    found = {
+    found = {  # NaN where a study leaves it known
         name: float(np.sqrt(np.mean([one.sd.get(unknown, np.nan) ** 2 for one in judged])))
         for name, unknown in BOUNDS.items()
     }
@@ -99,7 +104,7 @@ def deflection_of(
     nuisances: Sequence[Floats],
     prior: Floats,
 ) -> float:
-    """d' of a lump in all pictures together, the nuisances projected out as far as their priors leave room.
+    """Deflection d' of a lump in all pictures together, the nuisances projected out as far as their priors leave room.
 
     Parameters
     ----------
@@ -115,13 +120,13 @@ def deflection_of(
     return deflection(signal, weight, jacobian, np.diag(1.0 / prior**2))
 
 
-def reach(depths: Sequence[float], found: Sequence[float], size: float) -> float:
-    """Depth at which d' falls to `FOUND`, mm, from d' at some depths.
+def reach(middles: Sequence[float], found: Sequence[float], size: float) -> float:
+    """Depth at which d' falls to `FOUND`, mm, from d' of lumps whose middles are so deep.
 
-    Between depths, and beyond them, log d' is linear in the log of the centre's depth: far off it goes as its
+    Between them, and beyond them, log d' is linear in the log of the centre's depth: far off it goes as its
     inverse square (see `fem.emulator.amplitudes`).
     """
-    x = np.log(np.asarray(depths) + size / 2)
+    x = np.log(np.asarray(middles))
     y = np.log(np.maximum(np.asarray(found), 1e-12) / FOUND)
     if y[0] <= 0.0:  # not even the shallowest: what the last slope says, but never negative
         number = 0
