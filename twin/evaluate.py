@@ -144,6 +144,7 @@ def evaluate(
     quality: str = "preview",
     seed: int = 0,
     detection: bool = True,
+    fill: float | None = None,
     bench: Bench | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Evaluation:
@@ -155,6 +156,8 @@ def evaluate(
     unknowns : what nobody knows exactly, with what is known before; see `check_unknown`.
     emulator : of the design's mechanics; without, presses are solved on a coarse mesh at small strain.
     quality : of the light, "preview" or "standard".
+    fill : set the exposure so that the brightest thousandth of all these pictures begins at this share of the
+        camera's range, instead of the design's exposure; `Evaluation.layout` has it.
     detection : also find the depth at which a standard lump is found (a few pictures more).
     bench : keeps what layouts share; without, nothing is kept.
 
@@ -172,19 +175,42 @@ def evaluate(
     presses = [(place, level) for place in protocol.positions_mm for level in protocol.indentation_mm]
     seconds = {"mechanics": 0.0, "light": 0.0, "information": 0.0}
     work = _Work(small, every, emulator, quality, seed, bench, seconds, inclusions[0])
-    judged = []
+    light = []
     for number, inclusion in enumerate(inclusions):
-        lit = []
+        light.append([])
         for done, (place, level) in enumerate(presses):
-            lit.append(work.lit(inclusion, level, place))
+            light[-1].append(work.lit(inclusion, level, place))
             tell((number + (done + 1) / len(presses)) / len(inclusions))
-        began = time.perf_counter()
-        judged.append(_judged(small, block, protocol, inclusion, every, lit))
-        seconds["information"] += time.perf_counter() - began
+    began = time.perf_counter()
+    if fill is not None:
+        design = _exposed(design, small, fill, [one.layers for lit in light for one in lit])
+        layout, small = replace(layout, design=design), pixels.coarse(design, bench.cell_mm)[0]
+        work.design = small
+    judged = [
+        _judged(small, block, protocol, inclusion, every, lit)
+        for inclusion, lit in zip(inclusions, light, strict=True)
+    ]
+    seconds["information"] += time.perf_counter() - began
     found = objectives.optical(small, protocol, judged, block)
     if detection:
         found["detection_depth_mm"] = _detection(work, protocol, judged[0], block, inclusions[0])
     return Evaluation(layout, every, tuple(judged), found, seconds, block, small)
+
+
+_BRIGHT = 99.9  # per cent of pixels that are to be below
+
+
+def _exposed(design: Design, small: Design, fill: float, radiance: Sequence[NDArray[Any]]) -> Design:
+    """The design with the exposure at which its brightest pixels fill that share of the range."""
+    camera = small.camera
+    top = min(camera.full_well_e, (2**camera.bits - 1 - camera.offset_dn) * camera.gain_e_per_dn)
+    planes = 2 if camera.colour == "mono" else 3
+    layers = [pixels.counted(small, one).layers.sum(axis=-planes - 1) for one in radiance]
+    bright = max(float(np.percentile(one, _BRIGHT)) for one in layers) * camera.gain_e_per_dn
+    if bright <= 0.0:
+        raise DesignError("leds", "no light that reaches the camera", "LEDs that shine")
+    exposure = float(np.clip(design.camera.exposure_ms * fill * top / bright, 1e-3, 1e5))
+    return replace(design, camera=replace(design.camera, exposure_ms=float(f"{exposure:.4g}")))
 
 
 def expand(design: Design, unknowns: Sequence[Unknown]) -> tuple[Unknown, ...]:
@@ -365,7 +391,9 @@ class _Work:
         bodies = design.probe(), design.slab(), inclusion, design.mechanics if known else "linear"
         return what, 1, bodies, felt, known, level, place, self.moving
 
-    def _light_key(self, what: str, inclusion: fem.Inclusion, level: float, place: tuple[float, float]) -> Any:
+    def _light_key(
+        self, what: str, inclusion: fem.Inclusion, level: float, place: tuple[float, float]
+    ) -> Any:
         own = optical_key(self.design), self.quality, self.seed, self.bench.samples
         return self._key(what, inclusion, level, place), own, self.ground
 
@@ -426,7 +454,9 @@ def _camera_slope(design: Design, radiance: NDArray[Any], unknown: Unknown) -> t
     tables = tables_of(design)
     value = number_at(tables, unknown.name, "unknowns")
     if value is None or (unknown.relative and value == 0.0):
-        raise DesignError("unknowns", f"{unknown.name} = {shown(value)}", "a number that the design holds, > 0")
+        raise DesignError(
+            "unknowns", f"{unknown.name} = {shown(value)}", "a number that the design holds, > 0"
+        )
     step = 1e-3 if unknown.relative else 1e-3 * max(abs(value), 1e-3)
     ends = (value * np.exp(-step), value * np.exp(step)) if unknown.relative else (value - step, value + step)
     found = []
@@ -442,9 +472,7 @@ def _camera_slope(design: Design, radiance: NDArray[Any], unknown: Unknown) -> t
     return layers, whole - np.where(both, layers.sum(axis=-planes - 1), 0.0)
 
 
-def _detection(
-    work: _Work, protocol: Protocol, judged: Judged, block: float, near: fem.Inclusion
-) -> float:
+def _detection(work: _Work, protocol: Protocol, judged: Judged, block: float, near: fem.Inclusion) -> float:
     """Depth at which the standard lump is found by all levels at the first place."""
     design, depths = work.design, work.depths()
     if len(depths) < 2:

@@ -21,7 +21,7 @@ import numpy as np
 
 from twin.complaint import DesignError, shown
 from twin.design import Design, parse_design
-from twin.evaluate import Layout, Protocol, optical_key
+from twin.evaluate import Layout, optical_key
 from twin.fields import tables_of
 from twin.layout_study import Axis, LayoutStudy, Use, axis
 
@@ -62,7 +62,12 @@ def axes(study: LayoutStudy, design: Design) -> dict[str, Axis]:
             raise DesignError(where, "it", f"one of {', '.join(PROTOCOL)}")
         if name.startswith("layout.") and name not in SPECIAL:
             raise DesignError(where, "it", f"one of {', '.join(SPECIAL)}")
-        if name in ("protocol.indentation_mm", "protocol.positions_mm", "layout.arrangement", "layout.layers"):
+        if name in (
+            "protocol.indentation_mm",
+            "protocol.positions_mm",
+            "layout.arrangement",
+            "layout.layers",
+        ):
             if one.choices is None:
                 raise DesignError(where, "a range", "{choices = [...]}")
         elif name not in (*SPECIAL, *PROTOCOL):
@@ -159,7 +164,7 @@ def kind_of(study: LayoutStudy, design: Design, name: str, one: Axis) -> Kind:
     if name in PROTOCOL:
         return "optical"
     seen, pressed = set(), set()
-    for value in _some(one, whole(name, design)):
+    for value in some(one, whole(name, design)):
         try:
             there = layout(study, design, {name: said(value)}).design
             small = coarse(there)[0]
@@ -173,7 +178,8 @@ def kind_of(study: LayoutStudy, design: Design, name: str, one: Axis) -> Kind:
     return "optical" if len(seen) > 1 else "camera"
 
 
-def _some(one: Axis, integer: bool) -> list[Any]:
+def some(one: Axis, integer: bool) -> list[Any]:
+    """A few values of a field: its choices, or the ends and the middle of its range."""
     if one.choices is not None:
         return list(one.choices)
     assert one.range is not None
@@ -242,9 +248,13 @@ def _paths(node: Any, steps: Sequence[str], where: str, name: str) -> list[tuple
                 after.append((*path, step))
             else:
                 place = ".".join(steps[:depth]) or "the design"
-                names = ", ".join(here) if isinstance(here, Mapping) else f'"*" or 0 to {len(here) - 1}' if (
-                    isinstance(here, list)
-                ) else "nothing below it"
+                names = (
+                    ", ".join(here)
+                    if isinstance(here, Mapping)
+                    else f'"*" or 0 to {len(here) - 1}'
+                    if (isinstance(here, list))
+                    else "nothing below it"
+                )
                 special = f", {', '.join((*SPECIAL, *PROTOCOL))}" if depth == 0 else ""
                 raise DesignError(where, shown(step), f"a field of {place}: {names}{special}")
         found = after

@@ -186,11 +186,15 @@ def axis(where: str, value: Any) -> Axis:
         what = from_validation(error, value, TypeAdapter(Axis).json_schema())
         raise DesignError(where, what.received, allowed) from None
     if (found.range is None) == (found.choices is None):
-        raise DesignError(where, "both range and choices" if found.range else "neither range nor choices", allowed)
+        raise DesignError(
+            where, "both range and choices" if found.range else "neither range nor choices", allowed
+        )
     if found.range is not None:
         low, high = found.range
         if not low < high:
-            raise DesignError(where, shown(list(found.range)), "[lowest, highest], the first below the second")
+            raise DesignError(
+                where, shown(list(found.range)), "[lowest, highest], the first below the second"
+            )
         if found.log and low <= 0:
             raise DesignError(where, shown(low), "a lowest value > 0 where log = true")
     if found.choices is not None:
@@ -222,7 +226,9 @@ def limits(constraints: tuple[str, ...]) -> list[Limit]:
         limit = Limit(name, sign, value, text)
         for other in found:
             if other.name == name and other.sign != sign and sign * (other.value - value) > 0:
-                raise DesignError(where, f"{text!r} beside {other.text!r}", "constraints that can both be met")
+                raise DesignError(
+                    where, f"{text!r} beside {other.text!r}", "constraints that can both be met"
+                )
         found.append(limit)
     return found
 

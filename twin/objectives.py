@@ -37,7 +37,9 @@ class Objective:
 OBJECTIVES: dict[str, Objective] = {
     one.name: one
     for one in (
-        Objective("bound_size_mm", "minimize", "bound on the diameter, mm, rms over the inclusions", 0, np.inf),
+        Objective(
+            "bound_size_mm", "minimize", "bound on the diameter, mm, rms over the inclusions", 0, np.inf
+        ),
         Objective("bound_depth_mm", "minimize", "bound on the depth, mm, rms over the inclusions", 0, np.inf),
         Objective("bound_modulus_kPa", "minimize", "bound on E, kPa, rms over the inclusions", 0, np.inf),
         Objective("detection_depth_mm", "maximize", "depth at which the standard lump is found", 0, np.inf),
@@ -47,7 +49,9 @@ OBJECTIVES: dict[str, Objective] = {
         Objective("led_power_W", "minimize", "flux of all LEDs, W", 0, np.inf),
         Objective("saturated_percent", "minimize", "pixels that are full, of the worst picture", 0, 100),
         Objective("presses", "minimize", "presses that the protocol takes", 1, np.inf),
-        Objective("exposures", "minimize", "exposures that the protocol takes, references left out", 1, np.inf),
+        Objective(
+            "exposures", "minimize", "exposures that the protocol takes, references left out", 1, np.inf
+        ),
         Objective("thickness_mm", "minimize", "thickness of the waveguide, mm", 0, np.inf),
     )
 }
@@ -72,25 +76,33 @@ def optical(design: Design, protocol: Protocol, judged: Sequence[Judged], block:
     from twin.coarse import noise
 
     spread = noise(design, block, 1)
-    found = {  # NaN where a study leaves it known
-        name: float(np.sqrt(np.mean([one.sd.get(unknown, np.nan) ** 2 for one in judged])))
+    found = {
+        name: float(np.sqrt(np.mean([one.sd[unknown] ** 2 for one in judged])))
         for name, unknown in BOUNDS.items()
+        if unknown in judged[0].sd
     }
     signals = [_signal(one.mean, spread, protocol.frames) for one in judged]
     camera = design.camera
     plain = np.asarray(judged[0].mean[1::2], np.float64) - camera.offset_dn
     top = min(2**camera.bits - 1, camera.offset_dn + camera.full_well_e / camera.gain_e_per_dn)
     low, high = np.percentile(_grey(plain[0]), [1.0, 99.0])
-    presses = len(protocol.indentation_mm) * len(protocol.positions_mm)
     return {
         **found,
         "snr": float(np.mean([one[0] for one in signals])),
         "contrast": float(np.mean([one[1] for one in signals])),
         "uniformity": float(np.clip(low / high, 0.0, 1.0)) if high > 0 else 0.0,
-        "led_power_W": float(sum(led.flux_W for led in design.leds)),
+        **beforehand(design, protocol),
         "saturated_percent": max(
             100.0 * float((picture >= top * (1 - 1e-9)).mean()) for one in judged for picture in one.mean
         ),
+    }
+
+
+def beforehand(design: Design, protocol: Protocol) -> dict[str, float]:
+    """Return the objectives that nothing needs to be computed for."""
+    presses = len(protocol.indentation_mm) * len(protocol.positions_mm)
+    return {
+        "led_power_W": float(sum(led.flux_W for led in design.leds)),
         "presses": float(presses),
         "exposures": float(presses * protocol.frames),
         "thickness_mm": design.waveguide.thickness_mm,

@@ -281,7 +281,9 @@ def parse_study(text: str, source: str = "") -> Study:
     except ValueError:  # Python reads no integer of thousands of digits
         raise DesignError("the file", "a number that is too long", "numbers", source=source) from None
     if data.get("kind") == "layout":
-        raise DesignError("kind", "'layout'", "'corpus' (a layout study goes into `twin explore`)", source=source)
+        raise DesignError(
+            "kind", "'layout'", "'corpus' (a layout study goes into `twin explore`)", source=source
+        )
     schema = _ADAPTER.json_schema()
     found = list(not_finite(data, schema))
     if found:
