@@ -76,8 +76,8 @@ def error_budget(information: Information, wanted: Sequence[str]) -> Budget:
 def _noise(information: Information, wanted: tuple[str, ...], sd: Floats, best: Floats) -> Cost:
     """That of the pictures' noise: with half of it, four times the information."""
     halved = bound(replace(information, fisher=4.0 * information.fisher), wanted).sd
-    # A limit, not infinity: 1e8 times the frames leave 1e-4 of the noise. Directions that only the prior fixes,
-    # such as gain against the flux of all LEDs, may drown in rounding then: with fewer frames they do not.
+    # A limit, not infinity: 1e8 times the frames leave 1e-4 of the noise. Directions that only the prior
+    # fixes, such as gain against the flux of all LEDs, may drown in rounding then: not with fewer frames.
     for frames in (1e8, 1e6, 1e4, 1e2):
         known = bound(replace(information, fisher=frames * information.fisher), wanted).sd
         if np.isfinite(known).all():
