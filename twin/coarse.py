@@ -23,6 +23,8 @@ Floats = NDArray[np.float64]
 CELL_MM = 0.2
 """Side of a coarse pixel on the contact surface, mm, where the camera has finer ones."""
 
+_SHORTEST_MS = 1e-3  # as `scenes.imager.Camera` has it
+
 
 @dataclass(frozen=True)
 class Counted:
@@ -52,6 +54,13 @@ def coarse(design: Design, cell_mm: float = CELL_MM) -> tuple[Design, float]:
         for many, extent in ((rows, camera.field_height_mm), (columns, camera.field_of_view_mm))
     ]
     block = rows * columns / (fewer[0] * fewer[1])
+    # where the exposure may not be as short as that, the lens takes the rest, unless its blur matters
+    exposure = (
+        max(camera.exposure_ms / block, _SHORTEST_MS)
+        if camera.focus_mm == 0.0
+        else camera.exposure_ms / block
+    )
+    closed = float(np.sqrt(exposure * block / camera.exposure_ms))
     pixel = camera.pixel_um[0] * camera.columns / fewer[1], camera.pixel_um[1] * camera.rows / fewer[0]
     try:
         small = replace(
@@ -60,8 +69,9 @@ def coarse(design: Design, cell_mm: float = CELL_MM) -> tuple[Design, float]:
             columns=fewer[1],
             pixel_um=pixel,
             binning=1,
-            exposure_ms=camera.exposure_ms / block,
-            dark_current_e_s=camera.dark_current_e_s * block * camera.binning**2,
+            exposure_ms=exposure,
+            f_number=camera.f_number * closed,
+            dark_current_e_s=camera.dark_current_e_s * camera.exposure_ms / exposure * camera.binning**2,
             full_well_e=camera.full_well_e * camera.binning**2,
         )
     except ValidationError:
