@@ -144,12 +144,12 @@ class Renderer:
         passes = max(_LEAST_PASSES, -(-samples // each))
         lights: list[Light] = []
         if traced is not None:
-            self._check_leds(shape)
+            self.check_leds(shape)
             pictures, passes, noise = self._again(shape, sight, traced[0]), 1, None
         elif quality == "reference":
             pictures = self._followed(sight, -(-samples // passes), seed)
         else:
-            self._check_leds(shape)
+            self.check_leds(shape)
             pictures = self._gathered(shape, sight, max(samples // passes, 2), seed, lights)
         radiance, found = _averaged(pictures, passes, noise, progress or (lambda done: None))
         pressure, displacement_z = surface.at(shape, sight.position_mm)
@@ -166,7 +166,7 @@ class Renderer:
             (np.mean([light.traced for light in lights], axis=0),) if lights else traced,
         )
 
-    def _check_leds(self, shape: surface.OpticalSurface) -> None:
+    def check_leds(self, shape: surface.OpticalSurface) -> None:
         """Refuse LEDs that the deformed rim would shade: the gathered light knows no shade."""
         lowest = float((shape.rest_mm + shape.displacement_mm[..., 2]).min())
         for number, led in enumerate(self.sensor.leds):

@@ -117,7 +117,7 @@ def expected(
     slopes = []
     for number, unknown in enumerate(unknowns):
         value = stage.value(unknown.name)
-        step = _step(unknown, value)
+        step = step_of(unknown, value)
         ends = (value - step, value + step)
         if unknown.relative:
             ends = (value * np.exp(-step), value * np.exp(step))
@@ -156,7 +156,7 @@ def noise_of(design: Design, frames: int = 1) -> Noise:
     )
 
 
-def _step(unknown: Unknown, value: float) -> float:
+def step_of(unknown: Unknown, value: float) -> float:
     """Half the distance of the central difference, in the unknown's own unit."""
     if not unknown.sd > 0:
         raise DesignError(f"unknowns.{unknown.name}.sd", shown(unknown.sd), "a number > 0")
