@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -337,6 +338,7 @@ class _Weights:
     values: Floats
 
     @staticmethod
+    @lru_cache(maxsize=16)
     def of(noise: Noise, top: float) -> _Weights:
         least = min(max(noise.read_dn, 0.05), 1.0)
         step = least / _STEPS
