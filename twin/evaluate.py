@@ -6,17 +6,41 @@ see the same: counts are those of one true pixel, and information is multiplied 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 import fem
-from estimation.information import Information
+from estimation.information import Information, bound, inform
+from twin import coarse as pixels
+from twin import objectives, touches
+from twin.complaint import DesignError, shown
 from twin.design import Design
-from twin.forward import Unknown
+from twin.exposure import REFERENCE_FRAMES, light_seed
+from twin.fields import number_at, put, tables_of
+from twin.forward import PAPER_UNKNOWNS, Unknown, step_of
+from twin.kept import Arrays, Kept
+from twin.layers import Lighting, Lit
+from twin.touches import Touch, touches_contact
+
+if TYPE_CHECKING:
+    from fem import Emulator
 
 Singles = NDArray[np.float32]
+
+
+LED_FLUX = "leds.*.flux_W"
+"""As an unknown: the flux of every LED, each by itself."""
+
+UNKNOWNS = (*PAPER_UNKNOWNS, Unknown(LED_FLUX, 0.01, relative=True))
+"""`forward.PAPER_UNKNOWNS`, and LEDs that drift by a per cent between calibration and use."""
+
+MOST_BYTES = 400_000_000
+"""Largest `Judged.layer_jacobian`: larger ones are left out."""
 
 
 @dataclass(frozen=True)
@@ -88,3 +112,330 @@ class Evaluation:
     seconds: dict[str, float]
     block: float
     camera: Design
+
+
+@dataclass
+class Bench:
+    """What layouts share: what was computed before, and the sensor whose light is at hand."""
+
+    kept: Kept = field(default_factory=Kept)
+    cell_mm: float = pixels.CELL_MM
+    samples: int = 0
+    _lighting: tuple[Any, Lighting] | None = None
+
+    def lighting(self, design: Design, quality: str, seed: int) -> Lighting:
+        """Return the light of a sensor on coarse pixels; what the camera makes of it does not count."""
+        key = optical_key(design), quality, seed, self.samples
+        if self._lighting is None or self._lighting[0] != key:
+            self._lighting = None  # its scene goes before the next one comes
+            self._lighting = key, Lighting(design, quality, light_seed(seed), self.samples)
+        return self._lighting[1]
+
+
+def evaluate(
+    layout: Layout,
+    inclusions: Sequence[fem.Inclusion],
+    unknowns: Sequence[Unknown] = UNKNOWNS,
+    *,
+    emulator: Emulator | None = None,
+    quality: str = "preview",
+    seed: int = 0,
+    detection: bool = True,
+    bench: Bench | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Evaluation:
+    """Return what a layout can tell about each of the inclusions.
+
+    Parameters
+    ----------
+    inclusions : offsets are from the first of the protocol's places.
+    unknowns : what nobody knows exactly, with what is known before; see `check_unknown`.
+    emulator : of the design's mechanics; without, presses are solved on a coarse mesh at small strain.
+    quality : of the light, "preview" or "standard".
+    detection : also find the depth at which a standard lump is found (a few pictures more).
+    bench : keeps what layouts share; without, nothing is kept.
+
+    Raises
+    ------
+    DesignError, fem.NotModelled, scenes.sensor.NotModelled
+        For layouts that cannot be, in one line.
+    """
+    bench = bench or Bench()
+    tell = progress or (lambda done: None)
+    design, protocol = layout.design, layout.protocol
+    small, block = pixels.coarse(design, bench.cell_mm)
+    every = expand(design, unknowns)
+    check(layout, inclusions)
+    presses = [(place, level) for place in protocol.positions_mm for level in protocol.indentation_mm]
+    seconds = {"mechanics": 0.0, "light": 0.0, "information": 0.0}
+    work = _Work(small, every, emulator, quality, seed, bench, seconds)
+    judged = []
+    for number, inclusion in enumerate(inclusions):
+        lit = []
+        for done, (place, level) in enumerate(presses):
+            lit.append(work.lit(inclusion, level, place))
+            tell((number + (done + 1) / len(presses)) / len(inclusions))
+        began = time.perf_counter()
+        judged.append(_judged(small, block, protocol, inclusion, every, lit))
+        seconds["information"] += time.perf_counter() - began
+    found = objectives.optical(small, protocol, judged, block)
+    if detection:
+        found["detection_depth_mm"] = _detection(work, protocol, judged[0], block, inclusions[0])
+    return Evaluation(layout, every, tuple(judged), found, seconds, block, small)
+
+
+def expand(design: Design, unknowns: Sequence[Unknown]) -> tuple[Unknown, ...]:
+    """Return the unknowns one by one, `LED_FLUX` for each LED; raises `DesignError` for others than these."""
+    every: list[Unknown] = []
+    for unknown in unknowns:
+        names = [unknown.name]
+        if unknown.name == LED_FLUX:
+            names = [f"leds.{number}.flux_W" for number in range(len(design.leds))]
+        every += [replace(unknown, name=name) for name in names]
+    for unknown in every:
+        check_unknown(unknown)
+    names = [unknown.name for unknown in every]
+    for name in names:
+        if names.count(name) > 1:
+            raise DesignError("unknowns", f"{name} twice", "each once")
+    return tuple(every)
+
+
+_COUNTING = ("gain_e_per_dn", "offset_dn", "exposure_ms", "quantum_efficiency", "ambient", "dark_current_e_s")
+
+
+def check_unknown(unknown: Unknown) -> None:
+    """Raise `DesignError` for an unknown whose effect on the pictures is not modelled."""
+    camera = unknown.name.removeprefix("camera.") if unknown.name.startswith("camera.") else None
+    flux = unknown.name.startswith("leds.") and unknown.name.endswith(".flux_W")
+    if not (touches_contact(unknown.name) or camera in _COUNTING or flux):
+        allowed = (
+            "size_mm, depth_mm, modulus_kPa, offset_x_mm, offset_y_mm, press.indentation_mm, "
+            "specimen.modulus_kPa, specimen.thickness_mm, specimen.poisson, surface.rms_slope, surface.kappa, "
+            f"waveguide.layers.N.modulus_kPa, leds.*.flux_W, camera.{', camera.'.join(_COUNTING)}"
+        )
+        raise DesignError("unknowns", shown(unknown.name), allowed)
+    if not 0 < unknown.sd < np.inf:
+        raise DesignError(f"unknowns.{unknown.name}.sd", shown(unknown.sd), "a number > 0")
+
+
+def check(layout: Layout, inclusions: Sequence[fem.Inclusion]) -> None:
+    """Raise `DesignError` where a press of the protocol cannot be."""
+    if not inclusions:
+        raise DesignError("inclusions", "none", "at least one")
+    for level in layout.protocol.indentation_mm:
+        layout.design.check_indentation(level, "protocol.indentation_mm")
+    for inclusion in inclusions:
+        for x, y in layout.protocol.positions_mm:
+            offset = (inclusion.offset[0] - x, inclusion.offset[1] - y)
+            layout.design.check_inclusion(replace(inclusion, offset=offset))
+
+
+def optical_key(design: Design) -> tuple[Any, ...]:
+    """All of a sensor that its radiance depends on: not what the camera makes of it."""
+    camera = design.camera
+    seen = camera.rows, camera.columns, camera.field_of_view_mm, camera.distance_mm, camera.distortion
+    response = camera.quantum_efficiency if not isinstance(camera.quantum_efficiency, float) else None
+    sensor = design.sensor()
+    parts = sensor.guide, sensor.glass, sensor.leds, sensor.skin, sensor.tissue, sensor.effective_modulus_kPa
+    return (*seen, camera.colour, response, camera.pixel_um, design.light, *parts)
+
+
+@dataclass
+class _Work:
+    """The presses and the light of one layout."""
+
+    design: Design
+    unknowns: tuple[Unknown, ...]
+    emulator: Emulator | None
+    quality: str
+    seed: int
+    bench: Bench
+    seconds: dict[str, float]
+
+    def __post_init__(self) -> None:
+        self.moving = [unknown for unknown in self.unknowns if touches_contact(unknown.name)]
+
+    def touch(self, inclusion: fem.Inclusion, level: float, place: tuple[float, float]) -> Touch:
+        """The contact, from before or computed now; a solved one serves at every level."""
+        began = time.perf_counter()
+        solved = self.emulator is None
+        names = [unknown.name for unknown in self.moving]
+        steps = {u.name: step_of(u, touches.value_of(self.design, inclusion, u.name)) for u in self.moving}
+
+        def make() -> Arrays:
+            at = 1.0 if solved else level
+            found = touches.touch(self.design, inclusion, at, place, self.moving, self.emulator)
+            slopes = [found.slopes[name] for name in names]
+            return {
+                "fields": found.fields,
+                "plain": found.plain,
+                "slopes": np.stack(slopes) if slopes else np.zeros((0, 2, *found.fields.shape), np.float32),
+            }
+
+        if solved:
+            self.design.check_indentation(level)
+        got = self.bench.kept.get(self._key("touch", inclusion, 0.0 if solved else level, place), make)
+        by = level if solved else 1.0
+        self.seconds["mechanics"] += time.perf_counter() - began
+        slopes = {name: by * slope for name, slope in zip(names, got["slopes"], strict=True)}
+        return Touch(by * got["fields"], by * got["plain"], slopes, steps)
+
+    def lit(self, inclusion: fem.Inclusion, level: float, place: tuple[float, float]) -> Lit:
+        """The light of a press, from before or computed now."""
+        names = tuple(unknown.name for unknown in self.moving)
+
+        def make() -> Arrays:
+            touch = self.touch(inclusion, level, place)
+            began = time.perf_counter()
+            found = self.lighting.lit(touch, level, self.moving)
+            self.seconds["light"] += time.perf_counter() - began
+            return {"layers": found.layers, "slopes": found.slopes}
+
+        got = self.bench.kept.get(self._light_key("lit", inclusion, level, place), make)
+        return Lit(got["layers"], got["slopes"], names)
+
+    def standard(self, level: float, near: fem.Inclusion) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Radiance of plain tissue, and with the standard lump at each depth, at one level."""
+        size, modulus = objectives.STANDARD
+
+        def make() -> Arrays:
+            touch = self.touch(near, level, (0.0, 0.0))
+            began = time.perf_counter()
+            lighting = self.lighting
+            if level not in lighting.levels:
+                lighting.lit(touch, level, ())
+            plain, lumps = lighting.plain(level), []
+            self.seconds["light"] += time.perf_counter() - began
+            for depth in self.depths():
+                ball = fem.Inclusion(size, depth, modulus)
+                lump = self.lump(ball, level)
+                began = time.perf_counter()
+                lumps.append(lighting.seen(lump, level))
+                self.seconds["light"] += time.perf_counter() - began
+            # as the lumps were made: with the light that was traced for plain tissue
+            return {"plain": plain.astype(np.float32), "lumps": np.stack(lumps).astype(np.float32)}
+
+        got = self.bench.kept.get(self._light_key("standard", near, level, (0.0, 0.0)), make)
+        return got["plain"], got["lumps"]
+
+    def depths(self) -> list[float]:
+        """Depths at which the standard lump is pressed, within the slab."""
+        size, deepest = objectives.STANDARD[0], self.design.specimen.thickness_mm
+        return [depth for depth in objectives.STANDARD_DEPTHS_MM if depth + size < 0.9 * deepest]
+
+    def lump(self, ball: fem.Inclusion, level: float) -> NDArray[Any]:
+        """Contact fields of an inclusion without any slopes."""
+        work = replace(self, unknowns=(), seconds=self.seconds)
+        return work.touch(ball, level, (0.0, 0.0)).fields
+
+    @property
+    def lighting(self) -> Lighting:
+        return self.bench.lighting(self.design, self.quality, self.seed)
+
+    def _key(self, what: str, inclusion: fem.Inclusion, level: float, place: tuple[float, float]) -> Any:
+        design = self.design
+        known = None if self.emulator is None else (self.emulator.plan, float(self.emulator.pressure.sum()))
+        felt = design.effective_modulus_kPa, design.surface.rms_slope, design.surface.kappa
+        bodies = design.probe(), design.slab(), inclusion, design.mechanics if known else "linear"
+        return what, 1, bodies, felt, known, level, place, self.moving
+
+    def _light_key(self, what: str, inclusion: fem.Inclusion, level: float, place: tuple[float, float]) -> Any:
+        own = optical_key(self.design), self.quality, self.seed, self.bench.samples, objectives.STANDARD
+        return self._key(what, inclusion, level, place), own, objectives.STANDARD_DEPTHS_MM
+
+
+def _judged(
+    design: Design,
+    block: float,
+    protocol: Protocol,
+    inclusion: fem.Inclusion,
+    unknowns: tuple[Unknown, ...],
+    lit: Sequence[Lit],
+) -> Judged:
+    """What the pictures of one inclusion tell, from their light."""
+    radiance = np.concatenate([one.layers for one in lit])
+    counted = pixels.counted(design, radiance)
+    slopes = np.concatenate([one.slopes for one in lit], axis=1)
+    moving = lit[0].names
+    planes = 2 if design.camera.colour == "mono" else 3
+    of_leds = -planes - 1
+    keep = len(unknowns) * counted.layers.size * 4 <= MOST_BYTES
+    by_layer = np.zeros((len(unknowns), *counted.layers.shape), np.float32) if keep else None
+    jacobian = np.empty((len(unknowns), *counted.mean.shape), np.float32)
+    for number, unknown in enumerate(unknowns):
+        if unknown.name in moving:
+            layers = pixels.counted_slopes(design, slopes[moving.index(unknown.name)])
+            rest: Any = 0.0
+        elif unknown.name.startswith("leds."):
+            led = int(unknown.name.split(".")[1])
+            flux = design.leds[led].flux_W
+            layers, rest = np.zeros_like(counted.layers), 0.0
+            at = (slice(None), led)
+            layers[at] = counted.layers[at] / (1.0 if unknown.relative else flux)
+        else:
+            layers, rest = _camera_slope(design, radiance, unknown)
+        jacobian[number] = np.where(counted.open, layers.sum(axis=of_leds), 0.0) + rest
+        if by_layer is not None:
+            by_layer[number] = layers
+    noises = noises_of(design, block, protocol)
+    pictures = [(jacobian[:, k], counted.mean[k], noises[k % 2]) for k in range(len(counted.mean))]
+    names = tuple(unknown.name for unknown in unknowns)
+    told = inform(names, pictures, np.array([unknown.sd for unknown in unknowns]))
+    sd = dict(zip(names, map(float, bound(told).sd), strict=True))
+    single = np.float32
+    mean, layers = counted.mean.astype(single), counted.layers.astype(single)
+    return Judged(inclusion, mean, layers, names, jacobian, by_layer, told, sd)
+
+
+def noises_of(design: Design, block: float, protocol: Protocol) -> tuple[Any, Any]:
+    """Noise of a picture and of its reference, which is the mean of at least 16 exposures."""
+    return (
+        pixels.noise(design, block, protocol.frames),
+        pixels.noise(design, block, max(protocol.frames, REFERENCE_FRAMES)),
+    )
+
+
+def _camera_slope(design: Design, radiance: NDArray[Any], unknown: Unknown) -> tuple[Any, Any]:
+    """Slopes of the LEDs' counts to a number of the camera, and of the rest: dark, ambient, offset, well."""
+    tables = tables_of(design)
+    value = number_at(tables, unknown.name, "unknowns")
+    if value is None or (unknown.relative and value == 0.0):
+        raise DesignError("unknowns", f"{unknown.name} = {shown(value)}", "a number that the design holds, > 0")
+    step = 1e-3 if unknown.relative else 1e-3 * max(abs(value), 1e-3)
+    ends = (value * np.exp(-step), value * np.exp(step)) if unknown.relative else (value - step, value + step)
+    found = []
+    for end in ends:
+        from twin.design import parse_design
+
+        found.append(pixels.counted(parse_design(put(tables, [(unknown.name, float(end))])), radiance))
+    low, high = found
+    planes = 2 if design.camera.colour == "mono" else 3
+    layers = (high.layers - low.layers) / (2.0 * step)
+    whole = (high.mean - low.mean) / (2.0 * step)
+    both = low.open & high.open
+    return layers, whole - np.where(both, layers.sum(axis=-planes - 1), 0.0)
+
+
+def _detection(
+    work: _Work, protocol: Protocol, judged: Judged, block: float, near: fem.Inclusion
+) -> float:
+    """Depth at which the standard lump is found by all levels at the first place."""
+    design, depths = work.design, work.depths()
+    if len(depths) < 2:
+        return 0.0
+    plain, lumps = zip(*(work.standard(level, near) for level in protocol.indentation_mm), strict=True)
+    began = time.perf_counter()
+    lit, reference = noises_of(design, block, protocol)
+    kept = [k for k, unknown in enumerate(work.unknowns) if not touches.knows_inclusion(unknown.name)]
+    prior = np.array([work.unknowns[k].sd for k in kept])
+    means = [pixels.counted(design, one).mean for one in plain]
+    # of plain tissue, as of the references beside the pictures of any inclusion
+    slopes = [np.asarray(judged.jacobian[kept, 2 * k + 1], np.float64) for k in range(len(plain))]
+    found = []
+    for number in range(len(depths)):
+        lump = [pixels.counted(design, one[number]).mean for one in lumps]
+        pairs = [*means, *means], [*lump, *means], [lit] * len(means) + [reference] * len(means)
+        found.append(objectives.deflection_of(*pairs, [*slopes, *slopes], prior))
+    work.seconds["information"] += time.perf_counter() - began
+    return objectives.reach(depths, found, objectives.STANDARD[0])

@@ -108,6 +108,11 @@ class Lighting:
             tuple(unknown.name for unknown in moving),
         )
 
+    @property
+    def levels(self) -> tuple[float, ...]:
+        """Levels that were lit."""
+        return tuple(self._places)
+
     def seen(self, fields: Floats, level: float) -> Floats:
         """Radiance (n_led, rows, columns[, 3]) of another contact (4, n, n) of a level that was lit, with
         the light that was traced for plain tissue."""
