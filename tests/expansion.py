@@ -136,7 +136,7 @@ class Rounded:
         assert noise.bits is not None
         top = 2**noise.bits - 1
         self.step = 1 / 32 if noise.bits <= 8 else 1 / 2
-        at = np.arange(0.0, top + self.step, self.step)
+        at = np.arange(0.0, top + 8.0 * np.sqrt(mean_variance(top, noise)), self.step)
         sd = np.sqrt(mean_variance(at, noise))
         reach = int(np.ceil(8 * sd.max())) + 1
         number = np.clip(np.rint(at), 0, top)[:, None] + np.arange(-reach, reach + 1.0)
@@ -146,6 +146,8 @@ class Rounded:
         self.mean = (chance * number).sum(axis=1)
         self.variance = (chance * (number - self.mean[:, None]) ** 2).sum(axis=1)
         self.slope = np.gradient(self.mean, self.step)
+        self.full = top + 4.0 * sd[-1]  # pixels that look at a lamp tell nothing
+        self.variance = np.maximum(self.variance, 1e-6)
 
     def score(self, counts: Floats, mean: Floats, frames: int) -> Floats:
         """Best linear score of the average of so many rounded counts (Godambe's estimating function)."""
@@ -156,7 +158,8 @@ class Rounded:
         def table(values: Floats) -> Floats:
             return np.asarray(values[whole] * (1 - part) + values[whole + 1] * part)
 
-        return (counts - table(self.mean)) * table(self.slope) * frames / table(self.variance)
+        told = (counts - table(self.mean)) * table(self.slope) * frames / table(self.variance)
+        return np.where(mean < self.full, told, 0.0)
 
 
 def fit(
@@ -181,7 +184,9 @@ def fit(
             for start in range(0, counts.shape[1], _CHUNK):
                 some = slice(start, start + _CHUNK)
                 mean, seen = amounts @ rows[:, some], counts[:, some].astype(np.float64)
-                score = score_of_one(seen, mean, noise) if law is None else law.score(seen, mean, noise.frames)
+                score = (
+                    score_of_one(seen, mean, noise) if law is None else law.score(seen, mean, noise.frames)
+                )
                 gained += score @ rows[:, some].T
         gradient = np.einsum("mpq,mq->mp", slopes, gained) - (delta - calibrated) @ precision
         # the weak direction turns as one goes along it: every set of pictures has its own information

@@ -51,9 +51,7 @@ def judged(side: int = 24) -> Judged:
     mean, jacobian = picture(TRUTH, np.ones(4), side), slopes_of(lambda t: picture(t, np.ones(4), side))
     layer = slopes_of(lambda t: fields(t, side))
     told = inform(NAMES, [(jacobian[:, 0], mean[0], NOISE), (jacobian[:, 1], mean[1], REFERENCE)], PRIOR)
-    return Judged(
-        twin.Inclusion(9.0, 5.0, 60.0), mean, fields(TRUTH, side), NAMES, jacobian, layer, told, {}
-    )
+    return Judged(twin.Inclusion(9.0, 5.0, 60.0), mean, fields(TRUTH, side), NAMES, jacobian, layer, told, {})
 
 
 def made(side: int = 24, **more: Any) -> lit.Lamps:
@@ -70,7 +68,7 @@ def anew(intensity: Any, noise: Noise = NOISE) -> Information:
 
 def test_any_setting_is_the_picture_made_anew() -> None:
     """Flux, gain and offset among the unknowns: rounded counts, 20 settings, within 1e-3 of the bounds."""
-    given = made(block=9.0)
+    given = made(noise=replace(NOISE, frames=9), reference=replace(NOISE, frames=144))
     settings = np.random.default_rng(1).uniform(0, 2.5, (20, 4))
     settings[0] = 1.0
     found = lit.fishers(given, settings)
@@ -98,18 +96,24 @@ def test_one_after_the_other_is_the_sum_of_pictures_of_one() -> None:
 
 def test_a_thousand_settings_take_under_five_seconds() -> None:
     """Four inclusions, a picture and a reference of 3600 pixels, four LEDs, 12 unknowns."""
-    held = made(60)
+    one = judged(60)
+    assert one.layer_jacobian is not None
+    names = NAMES + tuple(f"{name}'" for name in NAMES)
+    noise = np.random.default_rng(2)
+    slopes = one.layer_jacobian + 0.1 * noise.standard_normal(one.layer_jacobian.shape) * one.layer_jacobian
     more = replace(
-        held,
-        slopes=np.concatenate([held.slopes, held.slopes[::-1]]),
-        gains=np.concatenate([held.gains, held.gains]),
-        shifts=np.concatenate([held.shifts, held.shifts]),
-        names=NAMES + tuple(f"{name}'" for name in NAMES),
-        prior=np.diag(np.concatenate([PRIOR, PRIOR]) ** -2.0),
+        one,
+        names=names,
+        jacobian=np.concatenate([one.jacobian, one.jacobian + (slopes - one.layer_jacobian).sum(axis=2)]),
+        layer_jacobian=np.concatenate([one.layer_jacobian, slopes]),
+        information=Information(names, np.eye(12), np.diag(np.concatenate([PRIOR, PRIOR]) ** -2.0)),
     )
+    given = [
+        lit.lamps(more, noise=NOISE, reference=REFERENCE, top=255.0, flux_W=np.ones(4)) for _ in range(4)
+    ]
     settings = np.random.default_rng(0).uniform(0.2, 1.5, (1000, 4))
     since = time.perf_counter()
-    found = lit.bounds([more] * 4, settings)
+    found = lit.bounds(given, settings)
     assert time.perf_counter() - since < 5.0
     assert found.shape == (1000, 4, 3) and np.isfinite(found).all()
 
