@@ -123,9 +123,12 @@ class Bench:
     samples: int = 0
     _lighting: tuple[Any, Lighting] | None = None
 
-    def lighting(self, design: Design, quality: str, seed: int) -> Lighting:
-        """Return the light of a sensor on coarse pixels; what the camera makes of it does not count."""
-        key = optical_key(design), quality, seed, self.samples
+    def lighting(self, design: Design, quality: str, seed: int, plain: Any) -> Lighting:
+        """Return the light of a sensor on coarse pixels; what the camera makes of it does not count.
+
+        ``plain`` names the mechanics of plain tissue, whose pictures its presses share.
+        """
+        key = repr((optical_key(design), quality, seed, self.samples, plain))
         if self._lighting is None or self._lighting[0] != key:
             self._lighting = None  # its scene goes before the next one comes
             self._lighting = key, Lighting(design, quality, light_seed(seed), self.samples)
@@ -141,6 +144,7 @@ def evaluate(
     quality: str = "preview",
     seed: int = 0,
     detection: bool = True,
+    fill: float | None = None,
     bench: Bench | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Evaluation:
@@ -152,6 +156,8 @@ def evaluate(
     unknowns : what nobody knows exactly, with what is known before; see `check_unknown`.
     emulator : of the design's mechanics; without, presses are solved on a coarse mesh at small strain.
     quality : of the light, "preview" or "standard".
+    fill : set the exposure so that the brightest thousandth of all these pictures begins at this share of the
+        camera's range, instead of the design's exposure; `Evaluation.layout` has it.
     detection : also find the depth at which a standard lump is found (a few pictures more).
     bench : keeps what layouts share; without, nothing is kept.
 
@@ -168,20 +174,43 @@ def evaluate(
     check(layout, inclusions)
     presses = [(place, level) for place in protocol.positions_mm for level in protocol.indentation_mm]
     seconds = {"mechanics": 0.0, "light": 0.0, "information": 0.0}
-    work = _Work(small, every, emulator, quality, seed, bench, seconds)
-    judged = []
+    work = _Work(small, every, emulator, quality, seed, bench, seconds, inclusions[0])
+    light = []
     for number, inclusion in enumerate(inclusions):
-        lit = []
+        light.append([])
         for done, (place, level) in enumerate(presses):
-            lit.append(work.lit(inclusion, level, place))
+            light[-1].append(work.lit(inclusion, level, place))
             tell((number + (done + 1) / len(presses)) / len(inclusions))
-        began = time.perf_counter()
-        judged.append(_judged(small, block, protocol, inclusion, every, lit))
-        seconds["information"] += time.perf_counter() - began
+    began = time.perf_counter()
+    if fill is not None:
+        design = _exposed(design, small, fill, [one.layers for lit in light for one in lit])
+        layout, small = replace(layout, design=design), pixels.coarse(design, bench.cell_mm)[0]
+        work.design = small
+    judged = [
+        _judged(small, block, protocol, inclusion, every, lit)
+        for inclusion, lit in zip(inclusions, light, strict=True)
+    ]
+    seconds["information"] += time.perf_counter() - began
     found = objectives.optical(small, protocol, judged, block)
     if detection:
         found["detection_depth_mm"] = _detection(work, protocol, judged[0], block, inclusions[0])
     return Evaluation(layout, every, tuple(judged), found, seconds, block, small)
+
+
+_BRIGHT = 99.9  # per cent of pixels that are to be below
+
+
+def _exposed(design: Design, small: Design, fill: float, radiance: Sequence[NDArray[Any]]) -> Design:
+    """The design with the exposure at which its brightest pixels fill that share of the range."""
+    camera = small.camera
+    top = min(camera.full_well_e, (2**camera.bits - 1 - camera.offset_dn) * camera.gain_e_per_dn)
+    planes = 2 if camera.colour == "mono" else 3
+    layers = [pixels.counted(small, one).layers.sum(axis=-planes - 1) for one in radiance]
+    bright = max(float(np.percentile(one, _BRIGHT)) for one in layers) * camera.gain_e_per_dn
+    if bright <= 0.0:
+        raise DesignError("leds", "no light that reaches the camera", "LEDs that shine")
+    exposure = float(np.clip(design.camera.exposure_ms * fill * top / bright, 1e-3, 1e5))
+    return replace(design, camera=replace(design.camera, exposure_ms=float(f"{exposure:.4g}")))
 
 
 def expand(design: Design, unknowns: Sequence[Unknown]) -> tuple[Unknown, ...]:
@@ -252,12 +281,30 @@ class _Work:
     seed: int
     bench: Bench
     seconds: dict[str, float]
+    ground: fem.Inclusion
+    """Whose mesh carries the press on plain tissue, where presses are solved."""
 
     def __post_init__(self) -> None:
         self.moving = [unknown for unknown in self.unknowns if touches_contact(unknown.name)]
 
     def touch(self, inclusion: fem.Inclusion, level: float, place: tuple[float, float]) -> Touch:
-        """The contact, from before or computed now; a solved one serves at every level."""
+        """The contact, from before or computed now.
+
+        Every solve has its own mesh, whose error in the background would look like a signal: what the
+        inclusion adds on its mesh is added to the one background.
+        """
+        found = self._touch(inclusion, level, place)
+        if self.emulator is not None or (inclusion, place) == (self.ground, (0.0, 0.0)):
+            return found
+        ground = self._touch(self.ground, level, (0.0, 0.0))
+        slopes = {}
+        for name, slope in found.slopes.items():
+            plain = ground.slopes[name][1]
+            slopes[name] = np.stack([plain + (slope[0] - slope[1]), plain])
+        return Touch(ground.plain + (found.fields - found.plain), ground.plain, slopes, found.steps)
+
+    def _touch(self, inclusion: fem.Inclusion, level: float, place: tuple[float, float]) -> Touch:
+        """On its own mesh; a solved one serves at every level."""
         began = time.perf_counter()
         solved = self.emulator is None
         names = [unknown.name for unknown in self.moving]
@@ -297,7 +344,7 @@ class _Work:
 
     def standard(self, level: float, near: fem.Inclusion) -> tuple[NDArray[Any], NDArray[Any]]:
         """Radiance of plain tissue, and with the standard lump at each depth, at one level."""
-        size, modulus = objectives.STANDARD
+        size, modulus = objectives.PRESSED
 
         def make() -> Arrays:
             touch = self.touch(near, level, (0.0, 0.0))
@@ -321,17 +368,21 @@ class _Work:
 
     def depths(self) -> list[float]:
         """Depths at which the standard lump is pressed, within the slab."""
-        size, deepest = objectives.STANDARD[0], self.design.specimen.thickness_mm
-        return [depth for depth in objectives.STANDARD_DEPTHS_MM if depth + size < 0.9 * deepest]
+        size, deepest = objectives.PRESSED[0], self.design.specimen.thickness_mm
+        return [depth for depth in objectives.PRESSED_DEPTHS_MM if depth + size < 0.9 * deepest]
 
     def lump(self, ball: fem.Inclusion, level: float) -> NDArray[Any]:
         """Contact fields of an inclusion without any slopes."""
-        work = replace(self, unknowns=(), seconds=self.seconds)
-        return work.touch(ball, level, (0.0, 0.0)).fields
+        work = replace(self, unknowns=())
+        own = work._touch(ball, level, (0.0, 0.0))
+        if self.emulator is not None:
+            return own.fields
+        return self._touch(self.ground, level, (0.0, 0.0)).plain + (own.fields - own.plain)
 
     @property
     def lighting(self) -> Lighting:
-        return self.bench.lighting(self.design, self.quality, self.seed)
+        plain = self._key("plain", self.ground, 0.0, (0.0, 0.0))
+        return self.bench.lighting(self.design, self.quality, self.seed, plain)
 
     def _key(self, what: str, inclusion: fem.Inclusion, level: float, place: tuple[float, float]) -> Any:
         design = self.design
@@ -340,9 +391,11 @@ class _Work:
         bodies = design.probe(), design.slab(), inclusion, design.mechanics if known else "linear"
         return what, 1, bodies, felt, known, level, place, self.moving
 
-    def _light_key(self, what: str, inclusion: fem.Inclusion, level: float, place: tuple[float, float]) -> Any:
-        own = optical_key(self.design), self.quality, self.seed, self.bench.samples, objectives.STANDARD
-        return self._key(what, inclusion, level, place), own, objectives.STANDARD_DEPTHS_MM
+    def _light_key(
+        self, what: str, inclusion: fem.Inclusion, level: float, place: tuple[float, float]
+    ) -> Any:
+        own = optical_key(self.design), self.quality, self.seed, self.bench.samples
+        return self._key(what, inclusion, level, place), own, self.ground
 
 
 def _judged(
@@ -401,7 +454,9 @@ def _camera_slope(design: Design, radiance: NDArray[Any], unknown: Unknown) -> t
     tables = tables_of(design)
     value = number_at(tables, unknown.name, "unknowns")
     if value is None or (unknown.relative and value == 0.0):
-        raise DesignError("unknowns", f"{unknown.name} = {shown(value)}", "a number that the design holds, > 0")
+        raise DesignError(
+            "unknowns", f"{unknown.name} = {shown(value)}", "a number that the design holds, > 0"
+        )
     step = 1e-3 if unknown.relative else 1e-3 * max(abs(value), 1e-3)
     ends = (value * np.exp(-step), value * np.exp(step)) if unknown.relative else (value - step, value + step)
     found = []
@@ -417,16 +472,15 @@ def _camera_slope(design: Design, radiance: NDArray[Any], unknown: Unknown) -> t
     return layers, whole - np.where(both, layers.sum(axis=-planes - 1), 0.0)
 
 
-def _detection(
-    work: _Work, protocol: Protocol, judged: Judged, block: float, near: fem.Inclusion
-) -> float:
+def _detection(work: _Work, protocol: Protocol, judged: Judged, block: float, near: fem.Inclusion) -> float:
     """Depth at which the standard lump is found by all levels at the first place."""
     design, depths = work.design, work.depths()
     if len(depths) < 2:
         return 0.0
     plain, lumps = zip(*(work.standard(level, near) for level in protocol.indentation_mm), strict=True)
     began = time.perf_counter()
-    lit, reference = noises_of(design, block, protocol)
+    lit, reference = (_patchy(noise, work.bench.cell_mm) for noise in noises_of(design, block, protocol))
+    share = (objectives.STANDARD[0] / objectives.PRESSED[0]) ** 3
     kept = [k for k, unknown in enumerate(work.unknowns) if not touches.knows_inclusion(unknown.name)]
     prior = np.array([work.unknowns[k].sd for k in kept])
     means = [pixels.counted(design, one).mean for one in plain]
@@ -435,7 +489,14 @@ def _detection(
     found = []
     for number in range(len(depths)):
         lump = [pixels.counted(design, one[number]).mean for one in lumps]
+        lump = [base + share * (one - base) for base, one in zip(means, lump, strict=True)]
         pairs = [*means, *means], [*lump, *means], [lit] * len(means) + [reference] * len(means)
         found.append(objectives.deflection_of(*pairs, [*slopes, *slopes], prior))
     work.seconds["information"] += time.perf_counter() - began
-    return objectives.reach(depths, found, objectives.STANDARD[0])
+    middles = [depth + objectives.PRESSED[0] / 2 for depth in depths]
+    return objectives.reach(middles, found, objectives.STANDARD[0])
+
+
+def _patchy(noise: Any, cell_mm: float) -> Any:
+    """Patches as errors of single coarse pixels, which weigh as much together."""
+    return replace(noise, fixed_share=objectives.PATCHY * objectives.PATCH_MM / cell_mm)

@@ -136,9 +136,7 @@ class Lighting:
         place = self._places[level]
         for unknown in moving:
             if unknown.name not in place.plain_slopes and not knows_inclusion(unknown.name):
-                found = self._slope(
-                    touch, unknown, 1, place.plain_layers, place.straight, place.plain_traced
-                )
+                found = self._slope(touch, unknown, 1, place.plain_layers, place.straight, place.plain_traced)
                 place.plain_slopes[unknown.name] = found
         return place
 
@@ -171,9 +169,7 @@ class Lighting:
         from scenes.render import PATHS_PER_LED
 
         whole, found = self.samples or PATHS_PER_LED[self.quality], []  # type: ignore[index]
-        for number, (renderer, band) in enumerate(
-            zip(self._renderers(), self._spectral.bands, strict=True)
-        ):
+        for number, (renderer, band) in enumerate(zip(self._renderers(), self._spectral.bands, strict=True)):
             seed = (self.seed + number * _SEED_STEP) % _SEEDS if number else self.seed
             paths = max(whole // band.parts, 2)
             found.append(tangent.traced(renderer, shape, straight[number], seed, self.quality, paths))

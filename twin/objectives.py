@@ -37,7 +37,9 @@ class Objective:
 OBJECTIVES: dict[str, Objective] = {
     one.name: one
     for one in (
-        Objective("bound_size_mm", "minimize", "bound on the diameter, mm, rms over the inclusions", 0, np.inf),
+        Objective(
+            "bound_size_mm", "minimize", "bound on the diameter, mm, rms over the inclusions", 0, np.inf
+        ),
         Objective("bound_depth_mm", "minimize", "bound on the depth, mm, rms over the inclusions", 0, np.inf),
         Objective("bound_modulus_kPa", "minimize", "bound on E, kPa, rms over the inclusions", 0, np.inf),
         Objective("detection_depth_mm", "maximize", "depth at which the standard lump is found", 0, np.inf),
@@ -47,16 +49,23 @@ OBJECTIVES: dict[str, Objective] = {
         Objective("led_power_W", "minimize", "flux of all LEDs, W", 0, np.inf),
         Objective("saturated_percent", "minimize", "pixels that are full, of the worst picture", 0, 100),
         Objective("presses", "minimize", "presses that the protocol takes", 1, np.inf),
-        Objective("exposures", "minimize", "exposures that the protocol takes, references left out", 1, np.inf),
+        Objective(
+            "exposures", "minimize", "exposures that the protocol takes, references left out", 1, np.inf
+        ),
         Objective("thickness_mm", "minimize", "thickness of the waveguide, mm", 0, np.inf),
     )
 }
 
-STANDARD = (5.0, 100.0)
+STANDARD = (1.5, 100.0)
 """Diameter, mm, and modulus, kPa, of the lump that is looked for."""
-STANDARD_DEPTHS_MM = (4.0, 6.0, 8.0, 11.0)
+PRESSED = (4.0, 100.0)
+"""The one that is pressed in its stead, about the same middle: small lumps signal in proportion to d³."""
+PRESSED_DEPTHS_MM = (4.0, 6.0, 8.0, 11.0)
 FOUND = 3.29
 """Deflection d' at which it counts as found: the ideal observer's AUC is 0.99."""
+PATCHY, PATCH_MM = 0.003, 1.0
+"""What hides a lump beside noise: skin that gives a share of light more or less than it should, in patches
+of so many mm, other ones in every press; no averaging of frames takes it away."""
 
 
 def optical(design: Design, protocol: Protocol, judged: Sequence[Judged], block: float) -> dict[str, float]:
@@ -68,24 +77,32 @@ def optical(design: Design, protocol: Protocol, judged: Sequence[Judged], block:
 
     spread = noise(design, block, 1)
     found = {
-        name: float(np.sqrt(np.mean([one.sd.get(unknown, np.nan) ** 2 for one in judged])))
+        name: float(np.sqrt(np.mean([one.sd[unknown] ** 2 for one in judged])))
         for name, unknown in BOUNDS.items()
+        if unknown in judged[0].sd
     }
     signals = [_signal(one.mean, spread, protocol.frames) for one in judged]
     camera = design.camera
     plain = np.asarray(judged[0].mean[1::2], np.float64) - camera.offset_dn
     top = min(2**camera.bits - 1, camera.offset_dn + camera.full_well_e / camera.gain_e_per_dn)
     low, high = np.percentile(_grey(plain[0]), [1.0, 99.0])
-    presses = len(protocol.indentation_mm) * len(protocol.positions_mm)
     return {
         **found,
         "snr": float(np.mean([one[0] for one in signals])),
         "contrast": float(np.mean([one[1] for one in signals])),
         "uniformity": float(np.clip(low / high, 0.0, 1.0)) if high > 0 else 0.0,
-        "led_power_W": float(sum(led.flux_W for led in design.leds)),
+        **beforehand(design, protocol),
         "saturated_percent": max(
             100.0 * float((picture >= top * (1 - 1e-9)).mean()) for one in judged for picture in one.mean
         ),
+    }
+
+
+def beforehand(design: Design, protocol: Protocol) -> dict[str, float]:
+    """Return the objectives that nothing needs to be computed for."""
+    presses = len(protocol.indentation_mm) * len(protocol.positions_mm)
+    return {
+        "led_power_W": float(sum(led.flux_W for led in design.leds)),
         "presses": float(presses),
         "exposures": float(presses * protocol.frames),
         "thickness_mm": design.waveguide.thickness_mm,
@@ -99,7 +116,7 @@ def deflection_of(
     nuisances: Sequence[Floats],
     prior: Floats,
 ) -> float:
-    """d' of a lump in all pictures together, the nuisances projected out as far as their priors leave room.
+    """Deflection d' of a lump in all pictures together, the nuisances projected out as far as their priors leave room.
 
     Parameters
     ----------
@@ -115,13 +132,13 @@ def deflection_of(
     return deflection(signal, weight, jacobian, np.diag(1.0 / prior**2))
 
 
-def reach(depths: Sequence[float], found: Sequence[float], size: float) -> float:
-    """Depth at which d' falls to `FOUND`, mm, from d' at some depths.
+def reach(middles: Sequence[float], found: Sequence[float], size: float) -> float:
+    """Depth at which d' falls to `FOUND`, mm, from d' of lumps whose middles are so deep.
 
-    Between depths, and beyond them, log d' is linear in the log of the centre's depth: far off it goes as its
+    Between them, and beyond them, log d' is linear in the log of the centre's depth: far off it goes as its
     inverse square (see `fem.emulator.amplitudes`).
     """
-    x = np.log(np.asarray(depths) + size / 2)
+    x = np.log(np.asarray(middles))
     y = np.log(np.maximum(np.asarray(found), 1e-12) / FOUND)
     if y[0] <= 0.0:  # not even the shallowest: what the last slope says, but never negative
         number = 0

@@ -92,8 +92,10 @@ def touch(
     x, y = (inclusion.offset[axis] - position[axis] for axis in (0, 1))
     there = replace(inclusion, offset=(x, y))
     wanted = [unknown for unknown in unknowns if touches_contact(unknown.name)]
-    return _emulated(design, there, level, wanted, emulator) if emulator else _solved(
-        design, there, level, wanted
+    return (
+        _emulated(design, there, level, wanted, emulator)
+        if emulator
+        else _solved(design, there, level, wanted)
     )
 
 
@@ -115,7 +117,9 @@ def _emulated(
         if unknown.name in _SKIN:
             found[unknown.name] = _skin(unknown, value, middle)
             continue
-        found[unknown.name] = _central(lambda to, name=unknown.name: fields({name: to}), unknown, value, step, middle)
+        found[unknown.name] = _central(
+            lambda to, name=unknown.name: fields({name: to}), unknown, value, step, middle
+        )
     return Touch(*middle, found, steps)
 
 
