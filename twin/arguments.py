@@ -98,7 +98,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
 
 
 def _parser() -> Parser:
-    from twin import corpus_arguments, study_arguments  # which takes its readers from here
+    from twin import corpus_arguments, explore_cli, study_arguments  # which takes its readers from here
 
     parser = Parser(
         prog="twin",
@@ -171,6 +171,7 @@ def _parser() -> Parser:
 
     corpus_arguments.add(verbs)
     study_arguments.add(verbs)
+    explore_cli.add(verbs)
     add_verb(verbs, "schema", "the JSON schema of a design file", _SCHEMA)
     return parser
 

@@ -99,10 +99,13 @@ def inclusion_label(told: dict[str, Any]) -> str:
 def budget(trials: Sequence[Trial], wanted: str = "modulus_kPa", most: int = 8) -> Figure:
     """Draw what knowing each unknown exactly, and twice as well, would take off the bound, per cent.
 
-    Root mean square over the inclusions, for the baseline and the winner.
+    Root mean square over the inclusions, for the baseline and the winner; unknowns below 0.5 % are left out,
+    but for the first three.
     """
     found = [shares(trial, wanted) for trial in trials]
-    order = sorted(found[0], key=lambda name: -max(one.get(name, (0.0, 0.0))[0] for one in found))[:most]
+    largest = {name: max(one.get(name, (0.0, 0.0))[0] for one in found) for name in found[0]}
+    order = sorted(largest, key=lambda name: -largest[name])[:most]
+    order = [name for place, name in enumerate(order) if place < 3 or largest[name] >= 0.005]
     figure, axes = panels(1, len(trials), 0.32 * len(order) + 1.1)
     place = np.arange(len(order))[::-1]
     longest = max(max(one[name][0] for name in order if name in one) for one in found)
@@ -115,7 +118,7 @@ def budget(trials: Sequence[Trial], wanted: str = "modulus_kPa", most: int = 8) 
         axis.set_xlim(0, 108 * longest + 1)
         axis.set_xlabel(f"off the bound on {UNITS[wanted][0]}, %")
         axis.set_title(trial.name, loc="left", fontsize=10, color=COLOURS[number % len(COLOURS)])
-    axes[-1].legend(frameon=False, fontsize=8.5, loc="lower right")
+    axes[0].legend(frameon=False, fontsize=8.5, loc="lower right")
     return figure
 
 

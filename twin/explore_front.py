@@ -23,7 +23,7 @@ _STYLE = f"""\
 .front {{ display: flex; gap: 1.2rem; align-items: flex-start; flex-wrap: wrap; }}
 .front svg {{ width: {_WIDTH}px; max-width: 100%; height: auto; }}
 .front .side {{ flex: 1 1 320px; min-width: 300px; font-size: .88rem; }}
-.front select {{ font: inherit; font-size: .88rem; max-width: 15rem; }}
+.front select {{ font: inherit; font-size: .88rem; width: 17rem; }}
 .front label {{ font-size: .88rem; margin-right: .8rem; color: #555; }}
 .front circle {{ cursor: pointer; }}
 .front circle:focus-visible {{ outline: 2px solid {INK}; outline-offset: 2px; }}
@@ -31,7 +31,9 @@ _STYLE = f"""\
 .front .side table {{ margin: .2rem 0 .6rem; width: 100%; }}
 .front .side td {{ white-space: normal; }}
 .front text {{ font: 12px system-ui, sans-serif; fill: {INK}; }}
+.key {{ font-size: .85rem; color: #555; margin: .2rem 0 0 {_LEFT}px; }}
 .key i {{ display: inline-block; width: .7rem; height: .7rem; border-radius: 50%; margin: 0 .3rem 0 .9rem; }}
+.key i:first-child {{ margin-left: 0; }}
 """
 
 _SCRIPT = """\
@@ -86,6 +88,7 @@ _SCRIPT = """\
       data.words[x.value]);
     put(svg, 'text', {transform: 'translate(14 ' + (box.top + box.high / 2) + ') rotate(-90)',
       'text-anchor': 'middle'}, data.words[y.value]);
+    var taken = [];
     var order = data.trials.slice().sort(function (a, b) { return a.rank - b.rank; });
     order.forEach(function (trial) {
       var a = trial.objectives[x.value], b = trial.objectives[y.value];
@@ -99,7 +102,11 @@ _SCRIPT = """\
       dot.addEventListener('keydown', function (event) {
         if (event.key === 'Enter' || event.key === ' ') { event.preventDefault(); choose(trial.id); }
       });
-      if (trial.rank > 1) put(svg, 'text', {x: px(a) + 10, y: py(b) - 8}, trial.name);
+      if (trial.rank < 2 && trial.id !== chosen) return;
+      var left = px(a) > box.left + box.wide - 80, at = py(b) + 4;
+      while (taken.some(function (t) { return Math.abs(t[1] - at) < 13 && Math.abs(t[0] - px(a)) < 75; })) at -= 13;
+      taken.push([px(a), at]);
+      put(svg, 'text', {x: px(a) + (left ? -11 : 11), y: at, 'text-anchor': left ? 'end' : 'start'}, trial.name);
     });
   }
   function table(title, rows) {
@@ -171,7 +178,7 @@ def front(results: Results) -> str:
         for colour, words in (
             (RED, "baseline"),
             (INK, "winners"),
-            (BLUE, "front: none is better in everything"),
+            (BLUE, "front (none beats them in everything)"),
             (GREY, "others"),
         )
     )
@@ -180,9 +187,10 @@ def front(results: Results) -> str:
         '<div id="front"><p>'
         f"<label>across {_select('front-x', names, first)}</label>"
         f"<label>up {_select('front-y', names, second)}</label>"
-        f'<span class="key">{key}</span></p>\n'
-        f'<div class="front"><svg id="front-svg" viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" tabindex="0" '
+        "</p>\n"
+        f'<div class="front"><div><svg id="front-svg" viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" tabindex="0" '
         f'aria-label="trials over two objectives">{_still(results, first, second)}</svg>\n'
+        f'<p class="key">{key}</p></div>\n'
         '<div class="side" id="front-side" aria-live="polite"></div></div></div>\n'
         f'<script type="application/json" id="front-data">{data}</script>\n<script>\n{_SCRIPT}</script>'
     )
@@ -238,7 +246,7 @@ def _second(first: str, names: list[str]) -> str:
 def _select(identity: str, names: list[str], chosen: str) -> str:
     options = "".join(
         f'<option value="{html.escape(name, quote=True)}"{" selected" if name == chosen else ""}>'
-        f"{html.escape(name)}</option>"
+        f"{html.escape(OBJECTIVES[name].text)}</option>"
         for name in names
     )
     return f'<select id="{identity}">{options}</select>'

@@ -152,15 +152,15 @@ def _still(top: Trial, base: Trial) -> str:
     reach, before = (one.objectives.get("detection_depth_mm") for one in (top, base))
     if reach is not None and before is not None:
         size, modulus = STANDARD
-        text += (
-            f"; a lump of {size:g} mm and {modulus:g} kPa would be found {digits(reach)} mm deep "
-            f"(baseline {digits(before)})"
-        )
+        design = _design(top)
+        slab = np.inf if design is None else design.specimen.thickness_mm
+        deep = [f"{digits(one)} mm deep" if one < slab else "at any depth" for one in (reach, before)]
+        text += f"; a lump of {size:g} mm and {modulus:g} kPa would be found {deep[0]} (baseline: {deep[1]})"
     return text + "."
 
 
 def _best(made: Page, results: Results, shown: Sequence[Trial]) -> None:
-    made.section("The best beside the baseline")
+    made.section("Best beside the baseline")
     fields = [name for name in results.fields() if any(name in one.values for one in shown)]
     rows = [[name, *(_value(one.values.get(name, "—")) for one in shown)] for name in fields]
     strong = []
@@ -169,7 +169,7 @@ def _best(made: Page, results: Results, shown: Sequence[Trial]) -> None:
             continue
         if name in results.objectives:
             strong.append(len(rows))
-        rows.append([objective.text, *(digits(one.objectives.get(name)) for one in shown)])
+        rows.append([objective.text, *(_found(one.objectives.get(name)) for one in shown)])
     made.table(
         ["", *(one.name for one in shown)],
         rows,
@@ -198,7 +198,7 @@ def _best(made: Page, results: Results, shown: Sequence[Trial]) -> None:
 
 
 def _known(made: Page, results: Results, shown: Sequence[Trial]) -> None:
-    made.section("What costs how much, and what can be found")
+    made.section("Costs and detection")
     told = [one for one in shown[:2] if _has_budget(one)]
     if told:
         made.figure(
@@ -237,7 +237,7 @@ def _budget_rows(budgets: Sequence[Sequence[Budget]]) -> list[list[str]]:
 
 
 def _mattered(made: Page, mattered: Sequence[Importance]) -> None:
-    made.section("Which fields mattered")
+    made.section("Fields that mattered")
     ways = "; ".join(dict.fromkeys(one.way for one in mattered))
     made.figure(
         figures.importance(mattered),
@@ -247,7 +247,7 @@ def _mattered(made: Page, mattered: Sequence[Importance]) -> None:
 
 
 def _designs(made: Page, results: Results, best: Sequence[Trial]) -> None:
-    made.section("Designs of the winners")
+    made.section("Designs")
     if not best:
         made.text("None.")
         return
@@ -275,7 +275,7 @@ def _designs(made: Page, results: Results, best: Sequence[Trial]) -> None:
 
 
 def _limits(made: Page, results: Results) -> None:
-    made.section("What was tried, and what it does not say")
+    made.section("Limits")
     if results.infeasible:
         reasons = Counter(str(one.reason) for one in results.infeasible)
         made.table(
@@ -318,6 +318,11 @@ def _has_budget(trial: Trial) -> bool:
         return bool(trial.budgets())
     except (OSError, KeyError, ValueError):
         return False
+
+
+def _found(value: float | None) -> str:
+    """An objective: whole numbers as such."""
+    return f"{value:.0f}" if value is not None and value == round(value) else digits(value)
 
 
 def _value(value: Any) -> str:

@@ -6,6 +6,7 @@ A study's fields are dotted names of the design ("leds.*.z_mm"), and these:
   +x, -x, +y, -y), "facing" (+x and -x only) or "one side" (+x), spread evenly along each side;
 - `layout.power_W`: flux of all LEDs together, shared evenly;
 - `layout.sheet_mm`: thickness of a white contact sheet, 0 for none;
+- `layout.match_gain`: true for a gain at which the full well is the converter's last count;
 - `layout.layers`: thickness and modulus of each layer, [[mm, kPa], ...] from the contact side;
 - `protocol.indentation_mm`, `protocol.positions_mm` (lists, as choices) and `protocol.frames`.
 """
@@ -28,7 +29,14 @@ from twin.layout_study import Axis, LayoutStudy, Use, axis
 Value = float | int | str
 Kind = str
 
-SPECIAL = ("layout.leds", "layout.arrangement", "layout.power_W", "layout.sheet_mm", "layout.layers")
+SPECIAL = (
+    "layout.leds",
+    "layout.arrangement",
+    "layout.power_W",
+    "layout.sheet_mm",
+    "layout.layers",
+    "layout.match_gain",
+)
 PROTOCOL = ("protocol.indentation_mm", "protocol.positions_mm", "protocol.frames")
 SHEET = {"modulus_kPa": 100.0, "scattering_per_mm": 30.0, "absorption_per_mm": 0.01}
 """The white sheet of `layout.sheet_mm`: silicone full of titanium dioxide."""
@@ -149,6 +157,11 @@ def changed_design(design: Design, fields: Mapping[str, Any], where: str) -> Des
             continue
         for path in _paths(tables, name.split("."), f"{where}.{name}", name):
             _put(tables, path, value)
+    if fields.get("layout.match_gain"):
+        camera = tables["camera"]
+        camera["gain_e_per_dn"] = (
+            camera["full_well_e"] * camera["binning"] ** 2 / (2 ** camera["bits"] - 1 - camera["offset_dn"])
+        )
     return parse_design(tables)
 
 
