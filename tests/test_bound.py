@@ -146,3 +146,48 @@ def test_the_maximum_of_the_posterior_reaches_the_bound_with_prior(emulator: fem
     found = spread(small(), 1, BOXED + NUISANCES, emulator, FAINT, 1.0)
     assert found["sd"][2] > 0.2
     judge(found, "a faint inclusion, with the prior")
+
+
+@pytest.mark.slow
+def test_derivatives_agree_with_other_steps(emulator: fem.Emulator) -> None:
+    """Half the step, every unknown: within 2 % of the Jacobian, rms over both pictures.
+
+    Twice: of `forward`, and of `evaluate`, which goes another way to the same pictures.
+    """
+    from twin.evaluate import UNKNOWNS, Bench, Layout, Protocol, evaluate
+
+    def halved(unknown: Unknown) -> Unknown:
+        most = {"size_mm": 1.0, "depth_mm": 1.0, "modulus_kPa": 20.0}.get(unknown.name, np.inf)
+        return replace(unknown, sd=min(unknown.sd, 0.2 if unknown.relative else most) / 2)
+
+    layout = Layout(shipped(), Protocol((2.0,)), {})
+    bench = Bench(cell_mm=0.5)
+    found = [
+        evaluate(layout, [BALL], unknowns, emulator=emulator, detection=False, bench=bench)
+        for unknowns in (UNKNOWNS, tuple(map(halved, UNKNOWNS)))
+    ]
+    slopes = [one.judged[0].jacobian for one in found]
+    unknowns = forward.PAPER_UNKNOWNS
+    for some in (unknowns, tuple(map(halved, unknowns))):
+        told = forward.expected(found[0].camera, BALL, (2.0,), some, emulator=emulator)
+        slopes.append(told.jacobian)
+    for one, other in (slopes[:2], slopes[2:]):
+        off = [float(np.linalg.norm(a - b) / np.linalg.norm(a)) for a, b in zip(one, other, strict=True)]
+        print("half the step, %:", np.round(100 * np.array(off), 2))
+        assert max(off) < 0.02
+
+
+@pytest.mark.slow
+def test_bounds_hardly_know_of_the_light_s_noise(emulator: fem.Emulator) -> None:
+    """Twice the light paths, and another seed: bounds on d, h and E within 5 %."""
+    from twin.evaluate import Bench, Layout, Protocol, evaluate
+
+    layout = Layout(shipped(), Protocol((2.0,)), {})
+    found = []
+    for samples, seed in ((2**17, 0), (2**18, 0), (2**17, 1)):
+        bench = Bench(cell_mm=0.5, samples=samples)
+        one = evaluate(layout, [BALL], emulator=emulator, seed=seed, detection=False, bench=bench)
+        found.append(np.array(list(one.judged[0].sd.values())))
+    change = np.array(found[1:]) / found[0] - 1
+    print("bounds, %:", np.round(100 * change, 2))
+    assert np.abs(change[:, :3]).max() < 0.05

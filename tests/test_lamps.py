@@ -181,3 +181,25 @@ def test_slopes_that_the_layers_do_not_hold_are_refused() -> None:
         lit.optimise([made()], power_W=0.0)
     with pytest.raises(ValueError, match="intensity"):
         lit.fishers(made(), [[1.0, 1.0, 1.0, -1.0]])
+
+
+@pytest.mark.slow
+def test_re_weighting_is_what_evaluating_anew_finds(variant: str) -> None:
+    """Real light, presses solved: four other fluxes, every bound within 0.2 %, pictures within 1e-4."""
+    from twin.evaluate import Bench, Layout, Protocol, evaluate
+
+    design, bench = twin.load_design("tsis"), Bench(cell_mm=0.8, samples=2**13)
+    share = np.array([1.6, 0.3, 1.2, 0.5])
+    leds = tuple(replace(led, flux_W=x * led.flux_W) for led, x in zip(design.leds, share, strict=True))
+    ball = twin.Inclusion(10.0, 5.0, 60.0)
+    first, anew = (
+        evaluate(Layout(one, Protocol((2.0,)), {}), [ball], detection=False, bench=bench)
+        for one in (design, replace(design, leds=leds))
+    )
+    (given,) = lit.lamps_of(first)
+    light = np.tensordot(share, first.judged[0].layers, (0, 1)) + given.pictures[0].dark[0]
+    assert light == pytest.approx(anew.judged[0].mean, rel=1e-4)
+    found = lit.bounds([given], share, given.names)[0, 0]
+    assert found == pytest.approx(np.array(list(anew.judged[0].sd.values())), rel=2e-3)
+    same = lit.bounds([given], np.ones(4), given.names)[0, 0]
+    assert same == pytest.approx(np.array(list(first.judged[0].sd.values())), rel=1e-5)

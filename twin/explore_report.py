@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import base64
 import html
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ import numpy as np
 
 from estimation.budget import Budget
 from twin import explore_figures as figures
+from twin import explore_leds
 from twin.complaint import DesignError
 from twin.design import Design, load_design
 from twin.explore_front import front
@@ -48,8 +48,10 @@ button { font: inherit; font-size: .85rem; }
 
 def write(folder: str | Path) -> Path:
     """Write report.html into a study's folder and return its path; raises `DesignError` in one line."""
-    place = Path(folder) / "report.html"
-    page(read(folder)).write(place)
+    place, results = Path(folder) / "report.html", read(folder)
+    best = [(one.folder, dict(one.values)) for one in results.best()[:1]]
+    explore_leds.find(Path(folder), [(results.baseline.folder, None), *best])
+    page(results).write(place)
     return place
 
 
@@ -75,6 +77,7 @@ def page(results: Results) -> Page:
     _known(made, results, [results.baseline, *best])
     if mattered:
         _mattered(made, mattered)
+    _leds(made, [results.baseline, *best[:1]])
     _designs(made, results, best)
     _limits(made, results)
     return made
@@ -155,7 +158,8 @@ def _still(top: Trial, base: Trial) -> str:
         design = _design(top)
         slab = np.inf if design is None else design.specimen.thickness_mm
         deep = [f"{digits(one)} mm deep" if one < slab else "at any depth" for one in (reach, before)]
-        text += f"; a lump of {size:g} mm and {modulus:g} kPa would be found {deep[0]} (baseline: {deep[1]})"
+        if min(reach, before) < slab:
+            text += f"; a lump of {size:g} mm and {modulus:g} kPa would be found {deep[0]} (baseline: {deep[1]})"
     return text + "."
 
 
@@ -219,8 +223,8 @@ def _known(made: Page, results: Results, shown: Sequence[Trial]) -> None:
         made.figure(
             figures.found_by_depth(shown, STANDARD, slab),
             f"Smallest stiff inclusion that is found (ideal observer, AUC 0.99) over its depth: from the depth at "
-            f"which one of {STANDARD[0]:g} mm is lost, by the far field of a sphere, d³ / (h + d/2)². It takes "
-            "the model as exact and says nothing of lumps that look like tissue's own unevenness.",
+            f"which one of {STANDARD[0]:g} mm is lost, by the far field of a sphere, d³ / (h + d/2)². A floor that "
+            "noise sets, for comparing layouts: the model is taken as exact, and tissue as even as the model's.",
         )
 
 
@@ -244,6 +248,34 @@ def _mattered(made: Page, mattered: Sequence[Importance]) -> None:
         f"Share of each field in how far the objective varies over the layouts that were tried: {ways}. It says "
         "nothing outside the ranges of the study.",
     )
+
+
+def _leds(made: Page, shown: Sequence[Trial]) -> None:
+    """Settings of the LEDs, from light that is there already."""
+    told = [(one, found) for one in shown if (found := explore_leds.read(one.folder)) is not None]
+    if not told:
+        return
+    made.section("LED by LED")
+    for one, found in told:
+        names = found["names"]
+        head = ["setting", "times the design's flux", "W", "brightest, %"]
+        head += [f"bound on {_SYMBOLS[name][0]}, {_SYMBOLS[name][1]}" for name in names]
+        rows = [
+            [
+                row["words"],
+                " / ".join(digits(value, 2) for value in row["intensity"]),
+                digits(row["power_W"]),
+                f"{100 * row['full']:.0f}",
+                *(digits(value) for value in row["sd"]),
+            ]
+            for row in found["settings"]
+        ]
+        for place, sd in zip(found["leds"], found["dark"], strict=False):
+            rows.append([f"LED at {place}: dark", "", "", "", *(digits(value) for value in sd)])
+        low, high = found["binning"]
+        spread = [f"{digits(a)} to {digits(b)}" for a, b in zip(low, high, strict=True)]
+        rows.append([f"bin of ± {100 * found['tolerance']:.0f} %, 9 of 10 sensors", "", "", "", *spread])
+        made.table(head, rows, f"{one.name}: light is linear, so no picture was rendered for these.")
 
 
 def _designs(made: Page, results: Results, best: Sequence[Trial]) -> None:
@@ -277,10 +309,14 @@ def _designs(made: Page, results: Results, best: Sequence[Trial]) -> None:
 def _limits(made: Page, results: Results) -> None:
     made.section("Limits")
     if results.infeasible:
-        reasons = Counter(str(one.reason) for one in results.infeasible)
+        kinds: dict[str, list[str]] = {}
+        for one in results.infeasible:
+            reason = str(one.reason)
+            kinds.setdefault(reason.partition(":")[0], []).append(reason)
+        most = sorted(kinds.items(), key=lambda item: -len(item[1]))[:12]
         made.table(
-            ["reason", "layouts"],
-            [[reason, str(count)] for reason, count in reasons.most_common(12)],
+            ["what", "layouts", "for example"],
+            [[what, str(len(reasons)), reasons[0].partition(": ")[2]] for what, reasons in most],
             "Layouts that could not be, or that miss a constraint.",
         )
     seconds = [one.told.get("seconds", {}) for one in results.trials]

@@ -130,6 +130,7 @@ def read(folder: str | Path) -> Results:
     try:
         study = tomllib.loads((place / "study.toml").read_text(encoding="utf-8"))
         baseline = _trial(place / "baseline", -1)
+        given = tomllib.loads(baseline.design_toml)
     except OSError as missing:
         raise DesignError(
             "DIR", shown(str(folder)), f"a folder of `twin explore` ({missing.strerror})"
@@ -138,6 +139,10 @@ def read(folder: str | Path) -> Results:
     for one in sorted((place / "trials").glob("[0-9]*")):
         if (one / "evaluation.json").is_file():  # the last file to appear
             every.append(_trial(one, int(one.name)))
+    used = {"protocol": baseline.told.get("protocol", {})}
+    own = {name: _given(given | used, str(name).split(".")) for name in study.get("fields", {})}
+    own = {name: value for name, value in own.items() if value is not None}
+    baseline = replace(baseline, values={**own, **baseline.values})
     constraints = tuple(str(text) for text in study.get("constraints", ()))
     limits = [limit for text in constraints if (limit := _LIMIT.fullmatch(text))]
     every = [_held_to(trial, limits) for trial in every]
@@ -296,6 +301,17 @@ def _by_rank(results: Results, fields: Sequence[str], objective: str) -> Importa
     total = sum(share.values()) or 1.0
     ordered = dict(sorted(((name, value / total) for name, value in share.items()), key=lambda x: -x[1]))
     return Importance(objective, ordered, f"squared rank correlation ({int(known.sum())} trials)")
+
+
+def _given(tables: Any, path: Sequence[str]) -> Value | None:
+    """What a dotted name means in a design and its protocol; of a star what all have, None where they differ."""
+    if not path:
+        return tables if isinstance(tables, str | int | float) else json.dumps(tables)
+    if isinstance(tables, list):
+        inside = tables if path[0] == "*" else tables[int(path[0]) :][:1] if path[0].isdigit() else []
+        found = [_given(one, path[1:]) for one in inside]
+        return found[0] if found and all(value == found[0] for value in found) else None
+    return _given(tables[path[0]], path[1:]) if isinstance(tables, dict) and path[0] in tables else None
 
 
 def _held_to(trial: Trial, limits: Sequence[re.Match[str]]) -> Trial:
