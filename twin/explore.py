@@ -364,11 +364,10 @@ def _try(exploration: Exploration, optuna_study: optuna.Study, trial: optuna.Tri
         optuna_study.tell(trial, state=TrialState.FAIL)
         return
     explored.write_trial(folder, found, values, trial.number)
-    for name, value in found.objectives.items():
-        trial.set_user_attr(name, value)
-    trial.set_user_attr(
-        "constraints", [limit.excess(found.objectives[limit.name]) for limit in exploration.limits]
-    )
+    trial.set_user_attr("objectives", found.objectives)  # at once: every attribute is a commit of its own
+    if exploration.limits:
+        excess = [limit.excess(found.objectives[limit.name]) for limit in exploration.limits]
+        trial.set_user_attr("constraints", excess)
     optuna_study.tell(trial, [found.objectives[name] for name in study.objectives])
 
 

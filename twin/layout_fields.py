@@ -176,6 +176,8 @@ def kind_of(study: LayoutStudy, design: Design, name: str, one: Axis) -> Kind:
         return "camera"
     if name in PROTOCOL:
         return "optical"
+    if name == "layout.layers":
+        return "mechanical"
     seen, pressed = set(), set()
     for value in some(one, whole(name, design)):
         try:
