@@ -42,7 +42,7 @@ def evaluation(flux: float, frames: int, side: str) -> Evaluation:
     noises = replace(NOISE, frames=9 * frames), replace(REFERENCE, frames=9 * max(frames, 16))
     judged = []
     for size, depth in ((9.0, 5.0), (7.0, 8.0)):
-        truth = TRUTH + [size - 9.0, depth - 5.0, 0, 0, 0, 0]
+        truth = TRUTH + np.array([size - 9.0, depth - 5.0, 0, 0, 0, 0])
         mean = picture(truth, intensity)
         slopes = slopes_of(lambda theta, at=truth: picture(theta - TRUTH + at, intensity))
         told = inform(NAMES, [(slopes[:, k], mean[k], noises[k]) for k in (0, 1)], PRIOR)
@@ -54,7 +54,8 @@ def evaluation(flux: float, frames: int, side: str) -> Evaluation:
         name: float(np.sqrt(np.mean([one.sd[unknown] ** 2 for one in judged])))
         for name, unknown in BOUNDS.items()
     }
-    found |= {"led_power_W": 4 * flux, "snr": 10 * np.sqrt(frames * flux), "detection_depth_mm": 9 + 40 * flux}
+    found |= {"led_power_W": 4 * flux, "snr": 10 * np.sqrt(frames * flux)}
+    found |= {"detection_depth_mm": 9 + 40 * flux}
     design = small()
     design = replace(design, leds=tuple(replace(led, flux_W=flux) for led in design.leds))
     unknowns = tuple(Unknown(name, float(sd)) for name, sd in zip(NAMES, PRIOR, strict=True))

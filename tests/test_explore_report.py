@@ -119,5 +119,5 @@ def test_a_browser_shows_it(study: Path, tmp_path: Path) -> None:
 
 
 def test_folders_that_are_none_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(DesignError, match="DIR: received .*; allowed a folder of `twin explore`"):
+    with pytest.raises(DesignError, match=r"DIR: received .*; allowed a folder of `twin explore`"):
         explore_report.write(tmp_path)

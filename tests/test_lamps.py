@@ -2,6 +2,7 @@
 
 import time
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 
 import twin
 from estimation.information import Information, Noise, bound, inform
+from twin import lamp_settings as settings_of
 from twin import lamps as lit
 from twin.complaint import DesignError
 from twin.evaluate import Judged
@@ -121,7 +123,7 @@ def test_a_thousand_settings_take_under_five_seconds() -> None:
 def test_the_optimum_beats_every_setting_of_a_grid() -> None:
     """Within the power of the design and without saturation; against all settings in steps of a twelfth."""
     given = [made()]
-    found = lit.optimise(given)
+    found = settings_of.optimise(given)
     assert found.best.power_W <= 0.04 * (1 + 1e-9) and found.best.full <= 1 + 1e-9
     assert found.best.worth <= found.before.worth
     twelfths = [
@@ -133,8 +135,8 @@ def test_the_optimum_beats_every_setting_of_a_grid() -> None:
 
 
 def test_more_power_never_hurts_and_saturation_ends_it() -> None:
-    worths = [lit.optimise([made()], power_W=power).best for power in (0.01, 0.04, 0.2, 10.0)]
-    assert all(b.worth <= a.worth * 1.001 for a, b in zip(worths, worths[1:], strict=False))
+    worths = [settings_of.optimise([made()], power_W=power).best for power in (0.01, 0.04, 0.2, 10.0)]
+    assert all(b.worth <= a.worth * 1.001 for a, b in pairwise(worths))
     assert worths[-1].full == pytest.approx(1.0) and worths[-1].power_W < 1.0
 
 
@@ -153,13 +155,13 @@ def test_more_light_never_hurts_below_saturation() -> None:
 def test_failures_and_bins() -> None:
     given = [made()]
     whole = lit.bounds(given, np.ones(4))[0]
-    dark = lit.failures(given, np.ones(4))
+    dark = settings_of.failures(given, np.ones(4))
     assert dark.shape == (4, 1, 3) and (dark > whole).all()
     assert dark[2] == pytest.approx(lit.bounds(given, [1.0, 1.0, 0.0, 1.0])[0])
-    spread = lit.binning(given, np.ones(4), 0.1)
+    spread = settings_of.binning(given, np.ones(4), 0.1)
     assert spread.shape == (200, 1, 3) and spread.std(axis=0).min() > 0
     assert np.abs(spread / whole - 1).max() < 0.2
-    assert lit.binning(given, np.ones(4), 0.0, draws=3) == pytest.approx(np.stack([whole] * 3))
+    assert settings_of.binning(given, np.ones(4), 0.0, draws=3) == pytest.approx(np.stack([whole] * 3))
 
 
 def test_slopes_that_the_layers_do_not_hold_are_refused() -> None:
@@ -178,7 +180,7 @@ def test_slopes_that_the_layers_do_not_hold_are_refused() -> None:
             replace(one, layer_jacobian=None), noise=NOISE, reference=NOISE, top=255.0, flux_W=np.ones(4)
         )
     with pytest.raises(DesignError, match="power_W"):
-        lit.optimise([made()], power_W=0.0)
+        settings_of.optimise([made()], power_W=0.0)
     with pytest.raises(ValueError, match="intensity"):
         lit.fishers(made(), [[1.0, 1.0, 1.0, -1.0]])
 

@@ -24,7 +24,9 @@ UNITS = {"size_mm": ("d", "mm", 1.0), "depth_mm": ("h", "mm", 1.0), "modulus_kPa
 """Symbol, unit and step of a sensitivity map."""
 
 
-def layouts(trials: Sequence[Trial], noises: Sequence[Noise], extent_mm: Sequence[tuple[float, float]]) -> Figure:
+def layouts(
+    trials: Sequence[Trial], noises: Sequence[Noise], extent_mm: Sequence[tuple[float, float]]
+) -> Figure:
     """Draw each layout's picture, its tared picture and what a step of d, h and E does, over the noise.
 
     ``noises`` is of one true pixel of each layout, ``extent_mm`` width and height that its pictures show.
@@ -41,7 +43,9 @@ def layouts(trials: Sequence[Trial], noises: Sequence[Noise], extent_mm: Sequenc
         maps = {name: UNITS[name][2] * _grey(slopes[name], 3)[0] * weight for name in UNITS if name in slopes}
         held.append((mean, maps))
     ends = {
-        name: max((float(np.quantile(np.abs(maps[name]), 0.999)) for _, maps in held if name in maps), default=1)
+        name: max(
+            (float(np.quantile(np.abs(maps[name]), 0.999)) for _, maps in held if name in maps), default=1
+        )
         for name in UNITS
     }
     brightest = max(float(mean[0].max()) for mean, _ in held)
@@ -52,13 +56,17 @@ def layouts(trials: Sequence[Trial], noises: Sequence[Noise], extent_mm: Sequenc
         drawn += [(maps[name], "PuOr_r", -ends[name], ends[name]) for name in maps]
         for column, (picture, colours, low, top) in enumerate(drawn):
             axis = axes[row, column]
-            shown = axis.imshow(picture, cmap=colours, vmin=low, vmax=top, extent=where, interpolation="nearest")
+            shown = axis.imshow(
+                picture, cmap=colours, vmin=low, vmax=top, extent=where, interpolation="nearest"
+            )
             axis.set_xticks([])
             axis.set_yticks([])
             for side in axis.spines.values():
                 side.set_visible(False)
             if row == rows - 1:
-                bar = figure.colorbar(shown, ax=axes[:, column], location="bottom", shrink=0.85, pad=0.02, aspect=18)
+                bar = figure.colorbar(
+                    shown, ax=axes[:, column], location="bottom", shrink=0.85, pad=0.02, aspect=18
+                )
                 bar.ax.tick_params(labelsize=8)
                 bar.outline.set_visible(False)
         axes[row, 0].set_ylabel(trial.name, fontsize=10, color=COLOURS[row % len(COLOURS)], fontweight="bold")
@@ -153,7 +161,10 @@ def found_by_depth(trials: Sequence[Trial], standard: tuple[float, float], slab_
         if reach is None or not np.isfinite(reach):
             continue
         axes[0].plot(
-            depth, least_size(depth, reach, standard[0]), color=COLOURS[number % len(COLOURS)], label=trial.name
+            depth,
+            least_size(depth, reach, standard[0]),
+            color=COLOURS[number % len(COLOURS)],
+            label=trial.name,
         )
     axes[0].set_xlabel("depth of the top, mm")
     axes[0].set_ylabel("smallest diameter found, mm")

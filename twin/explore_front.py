@@ -104,9 +104,11 @@ _SCRIPT = """\
       });
       if (trial.rank < 2 && trial.id !== chosen) return;
       var left = px(a) > box.left + box.wide - 80, at = py(b) + 4;
-      while (taken.some(function (t) { return Math.abs(t[1] - at) < 13 && Math.abs(t[0] - px(a)) < 75; })) at -= 13;
+      function meets(t) { return Math.abs(t[1] - at) < 13 && Math.abs(t[0] - px(a)) < 75; }
+      while (taken.some(meets)) at -= 13;
       taken.push([px(a), at]);
-      put(svg, 'text', {x: px(a) + (left ? -11 : 11), y: at, 'text-anchor': left ? 'end' : 'start'}, trial.name);
+      put(svg, 'text', {x: px(a) + (left ? -11 : 11), y: at, 'text-anchor': left ? 'end' : 'start'},
+        trial.name);
     });
   }
   function table(title, rows) {
@@ -188,8 +190,8 @@ def front(results: Results) -> str:
         f"<label>across {_select('front-x', names, first)}</label>"
         f"<label>up {_select('front-y', names, second)}</label>"
         "</p>\n"
-        f'<div class="front"><div><svg id="front-svg" viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" tabindex="0" '
-        f'aria-label="trials over two objectives">{_still(results, first, second)}</svg>\n'
+        f'<div class="front"><div><svg id="front-svg" viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" '
+        f'tabindex="0" aria-label="trials over two objectives">{_still(results, first, second)}</svg>\n'
         f'<p class="key">{key}</p></div>\n'
         '<div class="side" id="front-side" aria-live="polite"></div></div></div>\n'
         f'<script type="application/json" id="front-data">{data}</script>\n<script>\n{_SCRIPT}</script>'
@@ -200,9 +202,7 @@ def _content(results: Results) -> dict[str, Any]:
     """All that the script draws."""
     trials = [(results.baseline, "baseline", 2)]
     for place, trial in enumerate(results.trials):
-        kind = (
-            "winner" if place in results.winners else "front" if place in results.front else "other"
-        )
+        kind = "winner" if place in results.winners else "front" if place in results.front else "other"
         trials.append((trial, kind, {"winner": 2, "front": 1, "other": 0}[kind]))
     known = [name for name in OBJECTIVES if any(name in trial.objectives for trial, _, _ in trials)]
     best = results.best()
@@ -214,9 +214,7 @@ def _content(results: Results) -> dict[str, Any]:
                 "kind": kind,
                 "rank": rank,
                 "values": trial.values,
-                "objectives": {
-                    name: value for name, value in trial.objectives.items() if np.isfinite(value)
-                },
+                "objectives": {name: value for name, value in trial.objectives.items() if np.isfinite(value)},
             }
             for trial, kind, rank in trials
         ],
@@ -273,5 +271,6 @@ def _still(results: Results, first: str, second: str) -> str:
         x = _LEFT + wide * (0.06 + 0.88 * (a - spans[0][0]) / spans[0][1])
         y = _TOP + high * (0.94 - 0.88 * (b - spans[1][0]) / spans[1][1])
         said = f"{digits(a)}, {digits(b)}"
-        drawn.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="5" fill="{colour}"><title>{said}</title></circle>')
+        place = f'cx="{x:.1f}" cy="{y:.1f}" r="5" fill="{colour}"'
+        drawn.append(f"<circle {place}><title>{said}</title></circle>")
     return "".join(drawn)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twin import lamps
+from twin import lamp_settings, lamps
 from twin.evaluate import Bench, Evaluation, evaluate
 from twin.report import write_json
 
@@ -37,15 +37,15 @@ def findings(evaluation: Evaluation) -> dict[str, Any] | None:
     if count > _MOST_LEDS:
         return None
     ones = np.ones(count)
-    best = lamps.optimise(given, names)
+    best = lamp_settings.optimise(given, names)
     rows = [_row("as designed", best.before, names), _row("best at the same power", best.best, names)]
     if count > 1:
-        turns = lamps.optimise(given, names, sequential=True).best
+        turns = lamp_settings.optimise(given, names, sequential=True).best
         rows.append(_row(f"one after the other, {count} pictures", turns, names))
         same = _rms(lamps.bounds(given, ones, names, times=count))[0]
         rows.append({**rows[0], "words": f"all at once, {count} times the exposures", "sd": same})
-    dark = _rms(lamps.failures(given, ones, names)) if count > 1 else np.zeros((0, len(names)))
-    spread = np.quantile(_rms(lamps.binning(given, ones, TOLERANCE, names)), [0.05, 0.95], axis=0)
+    dark = _rms(lamp_settings.failures(given, ones, names)) if count > 1 else np.zeros((0, len(names)))
+    spread = np.quantile(_rms(lamp_settings.binning(given, ones, TOLERANCE, names)), [0.05, 0.95], axis=0)
     places = [f"{led.side}, {led.coupling}" for led in evaluation.layout.design.leds]
     return {
         "names": names,
@@ -57,7 +57,7 @@ def findings(evaluation: Evaluation) -> dict[str, Any] | None:
     }
 
 
-def _row(words: str, setting: lamps.Setting, names: tuple[str, ...]) -> dict[str, Any]:
+def _row(words: str, setting: lamp_settings.Setting, names: tuple[str, ...]) -> dict[str, Any]:
     return {
         "words": words,
         "intensity": setting.intensity,

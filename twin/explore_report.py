@@ -1,6 +1,6 @@
 """The page of a layout study: what to build and why, the front, the best layouts beside the baseline.
 
-    explore_report.write("out/leds")    # reads the study's folder, writes out/leds/report.html
+explore_report.write("out/leds")    # reads the study's folder, writes out/leds/report.html
 """
 
 from __future__ import annotations
@@ -99,14 +99,15 @@ def verdict(results: Results, mattered: Sequence[Importance] = ()) -> list[str]:
     gain = before / now if way == "minimize" else now / before
     if gain > 1.01:
         first = (
-            f"Build {top.name}: {words}: {digits(now)} instead of {digits(before)}, {gain:.2f} times better, with "
-            f"{changes(top, base)}."
+            f"Build {top.name}: {words}: {digits(now)} instead of {digits(before)}, {gain:.2f} times better, "
+            f"with {changes(top, base)}."
         )
     elif gain >= 0.99:
-        first = f"No layout is clearly better than the baseline in this: {words} ({digits(before)}). Keep the baseline."
+        first = f"Keep the baseline: no layout is clearly better in this: {words} ({digits(before)})."
     else:
         first = (
-            f"Keep the baseline: {words}: {digits(before)}; the best that was found, {top.name}, has {digits(now)}."
+            f"Keep the baseline: {words}: {digits(before)}; the best that was found, {top.name}, "
+            f"has {digits(now)}."
         )
     return [first, _why(results, top, mattered), _still(top, base)]
 
@@ -159,7 +160,8 @@ def _still(top: Trial, base: Trial) -> str:
         slab = np.inf if design is None else design.specimen.thickness_mm
         deep = [f"{digits(one)} mm deep" if one < slab else "at any depth" for one in (reach, before)]
         if min(reach, before) < slab:
-            text += f"; a lump of {size:g} mm and {modulus:g} kPa would be found {deep[0]} (baseline: {deep[1]})"
+            text += f"; a lump of {size:g} mm and {modulus:g} kPa would be found {deep[0]} "
+            text += f"(baseline: {deep[1]})"
     return text + "."
 
 
@@ -190,9 +192,9 @@ def _best(made: Page, results: Results, shown: Sequence[Trial]) -> None:
     ball = figures.inclusion_label(trials[0].told["inclusions"][0]).replace("\n", ", ")
     made.figure(
         figures.layouts(trials, noises, extent),
-        f"The first press on the first inclusion ({ball}; mm and kPa). Right: what one more mm of d and of h and 10 "
-        "kPa of E add to each pixel, in standard deviations of its noise as the protocol averages it; the same "
-        "scale in each column.",
+        f"The first press on the first inclusion ({ball}; mm and kPa). Right: what one more mm of d and of h "
+        "and 10 kPa of E add to each pixel, in standard deviations of its noise as the protocol averages it; "
+        "the same scale in each column.",
         pixels=True,
     )
     made.figure(
@@ -207,13 +209,16 @@ def _known(made: Page, results: Results, shown: Sequence[Trial]) -> None:
     if told:
         made.figure(
             figures.budget(told),
-            "Error budget of E: what a bound loses when one of the unknowns becomes known, exactly (grey) or twice "
-            "as well as now (colour): the calibration, or the averaging, that would buy most stands on top. The "
-            "unknowns share what they cost: the bars do not add up.",
+            "Error budget of E: what a bound loses when one of the unknowns becomes known, exactly (grey) or "
+            "twice as well as now (colour): the calibration, or the averaging, that would buy most stands on "
+            "top. The unknowns share what they cost: the bars do not add up.",
         )
         budgets = [one.budgets() for one in told]
         made.table(
-            ["bound, rms over inclusions", *(f"{one.name}: {what}" for one in told for what in ("now", "all known"))],
+            [
+                "bound, rms over inclusions",
+                *(f"{one.name}: {x}" for one in told for x in ("now", "all known")),
+            ],
             _budget_rows(budgets),
             "All known: with every unknown but d, h and E known exactly, so that noise alone is left.",
         )
@@ -222,9 +227,9 @@ def _known(made: Page, results: Results, shown: Sequence[Trial]) -> None:
         slab = 30.0 if design is None else design.specimen.thickness_mm
         made.figure(
             figures.found_by_depth(shown, STANDARD, slab),
-            f"Smallest stiff inclusion that is found (ideal observer, AUC 0.99) over its depth: from the depth at "
-            f"which one of {STANDARD[0]:g} mm is lost, by the far field of a sphere, d³ / (h + d/2)². A floor that "
-            "noise sets, for comparing layouts: the model is taken as exact, and tissue as even as the model's.",
+            "Smallest stiff inclusion that is found (ideal observer, AUC 0.99) over its depth: from where one "
+            f"of {STANDARD[0]:g} mm is lost, by the far field of a sphere, d³ / (h + d/2)². A floor that noise "
+            "sets, for comparing layouts: the model is taken as exact, and tissue as even as the model's.",
         )
 
 
@@ -245,8 +250,8 @@ def _mattered(made: Page, mattered: Sequence[Importance]) -> None:
     ways = "; ".join(dict.fromkeys(one.way for one in mattered))
     made.figure(
         figures.importance(mattered),
-        f"Share of each field in how far the objective varies over the layouts that were tried: {ways}. It says "
-        "nothing outside the ranges of the study.",
+        "Share of each field in how far the objective varies over the layouts that were tried: "
+        f"{ways}. It says nothing outside the ranges of the study.",
     )
 
 
@@ -320,7 +325,8 @@ def _limits(made: Page, results: Results) -> None:
             "Layouts that could not be, or that miss a constraint.",
         )
     seconds = [one.told.get("seconds", {}) for one in results.trials]
-    spent = {name: sum(one.get(name, 0.0) for one in seconds) for name in ("mechanics", "light", "information")}
+    parts = "mechanics", "light", "information"
+    spent = {name: sum(one.get(name, 0.0) for one in seconds) for name in parts}
     inclusions = results.baseline.told.get("inclusions", [])
     balls = "; ".join(figures.inclusion_label(one).replace("\n", ", ") for one in inclusions)
     items = [

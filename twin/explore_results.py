@@ -140,9 +140,12 @@ def read(folder: str | Path) -> Results:
         if (one / "evaluation.json").is_file():  # the last file to appear
             every.append(_trial(one, int(one.name)))
     used = {"protocol": baseline.told.get("protocol", {})}
-    own = {name: _given(given | used, str(name).split(".")) for name in study.get("fields", {})}
-    own = {name: value for name, value in own.items() if value is not None}
-    baseline = replace(baseline, values={**own, **baseline.values})
+    own: dict[str, Value] = {}
+    for name in study.get("fields", {}):
+        value = _given(given | used, str(name).split("."))
+        if value is not None:
+            own[name] = value
+    baseline = replace(baseline, values=own | baseline.values)
     constraints = tuple(str(text) for text in study.get("constraints", ()))
     limits = [limit for text in constraints if (limit := _LIMIT.fullmatch(text))]
     every = [_held_to(trial, limits) for trial in every]
@@ -287,9 +290,7 @@ def _by_rank(results: Results, fields: Sequence[str], objective: str) -> Importa
     rank = rankdata(target[known])
     share = {}
     for name in fields:
-        values = [
-            trial.values.get(name) for trial, keep in zip(results.trials, known, strict=True) if keep
-        ]
+        values = [trial.values.get(name) for trial, keep in zip(results.trials, known, strict=True) if keep]
         if all(isinstance(value, int | float) for value in values):
             other = rankdata(np.array(values, np.float64))
             flat = np.ptp(other) == 0 or np.ptp(rank) == 0
@@ -304,7 +305,7 @@ def _by_rank(results: Results, fields: Sequence[str], objective: str) -> Importa
 
 
 def _given(tables: Any, path: Sequence[str]) -> Value | None:
-    """What a dotted name means in a design and its protocol; of a star what all have, None where they differ."""
+    """What a dotted name means in a design and its protocol; a star: what all have, None if they differ."""
     if not path:
         return tables if isinstance(tables, str | int | float) else json.dumps(tables)
     if isinstance(tables, list):

@@ -2,8 +2,8 @@
 
 The pictures are those that a sensor's owner has: one per press level, and the reference without inclusion
 beside it. Derivatives are central differences over a step that is far below the prior, with the same light
-seed on both sides. Where only mechanics, roughness or the camera change, light that walked through the guide is
-taken from the middle (`Renderer.render(traced=...)`), so that the differences carry no noise of their own.
+seed on both sides. Where only mechanics, roughness or the camera change, light that walked through the guide
+is taken from the middle (`Renderer.render(traced=...)`), so that the differences carry no noise of their own.
 """
 
 from __future__ import annotations
