@@ -227,9 +227,9 @@ def _known(made: Page, results: Results, shown: Sequence[Trial]) -> None:
         slab = 30.0 if design is None else design.specimen.thickness_mm
         made.figure(
             figures.found_by_depth(shown, STANDARD, slab),
-            "Smallest stiff inclusion that is found (ideal observer, AUC 0.99) over its depth: from where one "
-            f"of {STANDARD[0]:g} mm is lost, by the far field of a sphere, d³ / (h + d/2)². A floor that noise "
-            "sets, for comparing layouts: the model is taken as exact, and tissue as even as the model's.",
+            "Smallest stiff inclusion that is found (ideal observer, AUC 0.99) over its depth: from where "
+            f"one of {STANDARD[0]:g} mm is lost, by the far field of a sphere, d³ / (h + d/2)². A floor that "
+            "noise sets, for comparing layouts: model and tissue are taken as exact and even.",
         )
 
 
