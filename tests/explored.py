@@ -12,10 +12,12 @@ from test_simulate import small
 
 import fem
 from estimation.information import bound, inform
+from twin import explore_leds
 from twin.evaluate import Evaluation, Judged, Layout, Protocol
 from twin.explored import write_infeasible, write_trial
 from twin.forward import Unknown
 from twin.objectives import BOUNDS
+from twin.report import write_json
 
 STUDY = """
 kind = "layout"
@@ -47,9 +49,11 @@ def evaluation(flux: float, frames: int, side: str) -> Evaluation:
         slopes = slopes_of(lambda theta, at=truth: picture(theta - TRUTH + at, intensity))
         told = inform(NAMES, [(slopes[:, k], mean[k], noises[k]) for k in (0, 1)], PRIOR)
         sd = dict(zip(NAMES, map(float, bound(told).sd), strict=True))
-        layers = np.moveaxis(fields(truth, 24), 0, 0)
+        share = intensity[:, None, None]
+        layers = share * fields(truth, 24)
+        by_layer = share * slopes_of(lambda theta, at=truth: fields(theta - TRUTH + at, 24))
         ball = fem.Inclusion(size, depth, 60.0)
-        judged.append(Judged(ball, mean, layers, NAMES, slopes, None, told, sd))
+        judged.append(Judged(ball, mean, layers, NAMES, slopes, by_layer, told, sd))
     found = {
         name: float(np.sqrt(np.mean([one.sd[unknown] ** 2 for one in judged])))
         for name, unknown in BOUNDS.items()
@@ -68,7 +72,9 @@ def write_study(folder: Path, trials: int = 24, name: str = "leds") -> Path:
     """Write the folder of a study; the last two layouts could not be."""
     folder.mkdir(parents=True)
     (folder / "study.toml").write_text(STUDY.format(name=name), encoding="utf-8")
-    write_trial(folder / "baseline", evaluation(0.01, 1, "around"), {}, None)
+    base = evaluation(0.01, 1, "around")
+    write_trial(folder / "baseline", base, {}, None)
+    write_json(folder / "baseline" / explore_leds.FILE, explore_leds.findings(base))
     rng = np.random.default_rng(4)
     for number in range(trials):
         flux, frames = float(np.exp(rng.uniform(np.log(0.004), np.log(0.06)))), int(rng.choice([1, 16]))

@@ -9,10 +9,11 @@ from browser import run, screenshot
 from explored import write_study
 from PIL import Image
 
-from twin import explore_report
+from twin import explore_leds, explore_report
 from twin.complaint import DesignError
 from twin.explore_figures import least_size, shares
 from twin.explore_results import front, importances, read, winners
+from twin.objectives import BOUNDS
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +62,21 @@ def test_shares_are_the_budgets(study: Path) -> None:
     base = read(study).baseline
     for known, halved in shares(base, "size_mm").values():
         assert -1e-9 <= halved <= known + 1e-9 <= 1 + 1e-9
+
+
+def test_leds_one_by_one(study: Path) -> None:
+    """Settings of the baseline: the best is no worse than its own, a dark LED no better, turns are stated."""
+    results = read(study)
+    found = explore_leds.read(results.baseline.folder)
+    assert found is not None
+    own, best, turns, same = (np.array(row["sd"]) for row in found["settings"])
+    assert np.prod(best) <= np.prod(own) and (same <= own).all() and np.isfinite(turns).all()
+    assert len(found["dark"]) == len(found["leds"]) == 4
+    assert (np.array(found["dark"]) >= own * (1 - 1e-9)).all()
+    low, high = np.array(found["binning"])
+    assert (low <= own).all() and (own <= high).all()
+    assert own == pytest.approx([results.baseline.objectives[name] for name in BOUNDS], rel=0.1)
+    assert "LED by LED" in (study / "report.html").read_text(encoding="utf-8")
 
 
 def test_importance_finds_what_was_turned(study: Path) -> None:
