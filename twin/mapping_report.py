@@ -279,12 +279,12 @@ def _fits(maps: Sequence[Mapped]) -> tuple[list[str], list[list[str]], str]:
         "norm. slope",
         "norm. intercept",
     ]
-    rows, left_out = list[list[str]](), list[str]()
+    rows, left_out = list[list[str]](), dict[str, list[str]]()
     for one in maps:
         row = one.row()
         first = [f"{one.level_mm:g} mm", one.kind, one.pair.name, str(len(one.x)), str(one.unseen)]
         if one.fit is None:
-            left_out.append(f"{one.level_mm:g} mm {one.kind} {one.pair.name} ({one.why})")
+            left_out.setdefault(one.why, []).append(f"{one.level_mm:g} mm {one.kind} {one.pair.name}")
             continue
         rows.append(
             [
@@ -305,7 +305,8 @@ def _fits(maps: Sequence[Mapped]) -> tuple[list[str], list[list[str]], str]:
         "pixels and mm². LOO: leave-one-out error (rms), % of the span of the picture's scalar."
     )
     if left_out:
-        caption += f" Without a line: {'; '.join(left_out)}."
+        told = "; ".join(", ".join(names) + f" ({why})" for why, names in left_out.items())
+        caption += f" No line: {told}."
     return head, rows, caption
 
 
