@@ -64,7 +64,7 @@ class SpectralRenderer:
         return alone if len(self.renderers) == 1 else Renderer(self.sensor, device=self._device)
 
     def together(self, each: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-        """Radiance (n_led, rows, columns[, 3]) of all bands, from that of each band's LEDs (n, rows, columns)."""
+        """Radiance (n_led, rows, columns[, 3]) of all bands, from each band's LEDs, (n, rows, columns)."""
         camera = self.sensor.camera
         planes = () if camera.colour == "mono" else (len(camera.channels),)
         radiance = np.zeros((len(self.sensor.leds), *camera.shape, *planes))

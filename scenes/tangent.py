@@ -78,7 +78,7 @@ def traced(
     light = straight.on(direct.relief(sensor, shape))
     parts = (renderer.scene, sensor, renderer.table, basis, behind, ground, light)
     with threadpool_limits(1):
-        found = transport.transport(*parts, samples or PATHS_PER_LED[quality], seed)  # type: ignore[index]
+        found = transport.transport(*parts, samples or PATHS_PER_LED[quality], seed)
     return found.traced
 
 

@@ -100,7 +100,7 @@ def test_slopes_have_closed_forms(bench: Any) -> None:
     assert np.abs(found.layers.sum(axis=1) - light).max() < dark
     assert found.layer_jacobian is not None
     assert found.layer_jacobian.sum(axis=2) == pytest.approx(found.jacobian, rel=1e-3, abs=dark)
-    # the law of rough contact knows p / (E* h'): in this bump tissue's modulus is pressure, less what E* takes
+    # rough contact knows p / (E* h'): in this bump tissue's modulus is pressure, less what E* takes
     slope = found.jacobian[at("surface.rms_slope")][1]
     star = design().effective_modulus_kPa * (1 - 0.49**2)
     felt = 1.0 - star / design().specimen.modulus_kPa
@@ -183,7 +183,7 @@ def test_unknowns_and_presses_that_cannot_be_are_refused(bench: Any) -> None:
     for unknown in (Unknown("surface.dust", 0.1), Unknown("camera.rows", 1.0), Unknown("size_mm", 0.0)):
         with pytest.raises(DesignError, match=r"received .*; allowed "):
             bench(layout(), (unknown,))
-    with pytest.raises(DesignError, match="protocol.indentation_mm"):
+    with pytest.raises(DesignError, match=r"protocol\.indentation_mm"):
         bench(layout((50.0,)))
 
 

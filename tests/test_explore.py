@@ -1,4 +1,4 @@
-"""Explorations: who tries what, what survives a kill, who shares, what is recorded. Evaluations are made up."""
+"""Explorations: who tries what, what survives a kill, who shares, what is kept. Evaluations are made up."""
 
 import json
 import multiprocessing
@@ -182,7 +182,7 @@ def test_two_processes_share_one_study(tmp_path: Path) -> None:
 
 def test_another_study_does_not_get_the_folder(tmp_path: Path) -> None:
     prepared(tmp_path, "latin", "out")
-    with pytest.raises(DesignError, match="--out: .*same study"):
+    with pytest.raises(DesignError, match=r"--out: .*same study"):
         prepared(tmp_path, "tpe", "out")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "letter.txt").write_text("dear")
@@ -196,7 +196,7 @@ def test_an_emulator_is_refused_where_the_mechanics_change(tmp_path: Path) -> No
     file = tmp_path / "soft.toml"
     text = STUDY.replace("METHOD", "latin").replace('"leds.*.z_mm"', '"waveguide.layers.0.modulus_kPa"')
     file.write_text(text.replace("[-11.0, -2.0]", "[10.0, 50.0]"))
-    with pytest.raises(DesignError, match="waveguide.layers.0.modulus_kPa, which changes the mechanics"):
+    with pytest.raises(DesignError, match=r"waveguide\.layers\.0\.modulus_kPa, which changes the mechanics"):
         explore.prepare(file, tmp_path / "out", emulator=tmp_path / "some.npz")
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,26 +18,35 @@ import fem
 from estimation.information import Information, bound, inform
 from twin import coarse as pixels
 from twin import objectives, touches
+from twin.bench import Bench, Work, optical_key
 from twin.complaint import DesignError, shown
 from twin.design import Design
-from twin.exposure import REFERENCE_FRAMES, light_seed
+from twin.exposure import REFERENCE_FRAMES
 from twin.fields import number_at, put, tables_of
-from twin.forward import PAPER_UNKNOWNS, Unknown, step_of
-from twin.kept import Arrays, Kept
-from twin.layers import Lighting, Lit
-from twin.touches import Touch, touches_contact
+from twin.forward import Unknown
+from twin.layers import Lit
+from twin.unknowns import LED_FLUX, UNKNOWNS, check_unknown, expand
 
 if TYPE_CHECKING:
     from fem import Emulator
 
+__all__ = [
+    "LED_FLUX",
+    "UNKNOWNS",
+    "Bench",
+    "Evaluation",
+    "Judged",
+    "Layout",
+    "Protocol",
+    "check",
+    "check_unknown",
+    "evaluate",
+    "expand",
+    "optical_key",
+]
+
 Singles = NDArray[np.float32]
 
-
-LED_FLUX = "leds.*.flux_W"
-"""As an unknown: the flux of every LED, each by itself."""
-
-UNKNOWNS = (*PAPER_UNKNOWNS, Unknown(LED_FLUX, 0.01, relative=True))
-"""`forward.PAPER_UNKNOWNS`, and LEDs that drift by a per cent between calibration and use."""
 
 MOST_BYTES = 400_000_000
 """Largest `Judged.layer_jacobian`: larger ones are left out."""
@@ -101,8 +110,8 @@ class Judged:
 class Evaluation:
     """All that was found about a layout; `objectives` by the names of `twin.objectives.OBJECTIVES`.
 
-    ``block`` is the number of true pixels that a coarse one stands for; ``camera`` is the design on the coarse
-    pixels: its counts, noise and full well are those of one true pixel.
+    ``block`` is the number of true pixels that a coarse one stands for; ``camera`` is the design on the
+    coarse pixels: its counts, noise and full well are those of one true pixel.
     """
 
     layout: Layout
@@ -112,27 +121,6 @@ class Evaluation:
     seconds: dict[str, float]
     block: float
     camera: Design
-
-
-@dataclass
-class Bench:
-    """What layouts share: what was computed before, and the sensor whose light is at hand."""
-
-    kept: Kept = field(default_factory=Kept)
-    cell_mm: float = pixels.CELL_MM
-    samples: int = 0
-    _lighting: tuple[Any, Lighting] | None = None
-
-    def lighting(self, design: Design, quality: str, seed: int, plain: Any) -> Lighting:
-        """Return the light of a sensor on coarse pixels; what the camera makes of it does not count.
-
-        ``plain`` names the mechanics of plain tissue, whose pictures its presses share.
-        """
-        key = repr((optical_key(design), quality, seed, self.samples, plain))
-        if self._lighting is None or self._lighting[0] != key:
-            self._lighting = None  # its scene goes before the next one comes
-            self._lighting = key, Lighting(design, quality, light_seed(seed), self.samples)
-        return self._lighting[1]
 
 
 def evaluate(
@@ -174,8 +162,8 @@ def evaluate(
     check(layout, inclusions)
     presses = [(place, level) for place in protocol.positions_mm for level in protocol.indentation_mm]
     seconds = {"mechanics": 0.0, "light": 0.0, "information": 0.0}
-    work = _Work(small, every, emulator, quality, seed, bench, seconds, inclusions[0])
-    light = []
+    work = Work(small, every, emulator, quality, seed, bench, seconds, inclusions[0])
+    light: list[list[Lit]] = []
     for number, inclusion in enumerate(inclusions):
         light.append([])
         for done, (place, level) in enumerate(presses):
@@ -213,41 +201,6 @@ def _exposed(design: Design, small: Design, fill: float, radiance: Sequence[NDAr
     return replace(design, camera=replace(design.camera, exposure_ms=float(f"{exposure:.4g}")))
 
 
-def expand(design: Design, unknowns: Sequence[Unknown]) -> tuple[Unknown, ...]:
-    """Return the unknowns one by one, `LED_FLUX` for each LED; raises `DesignError` for others than these."""
-    every: list[Unknown] = []
-    for unknown in unknowns:
-        names = [unknown.name]
-        if unknown.name == LED_FLUX:
-            names = [f"leds.{number}.flux_W" for number in range(len(design.leds))]
-        every += [replace(unknown, name=name) for name in names]
-    for unknown in every:
-        check_unknown(unknown)
-    names = [unknown.name for unknown in every]
-    for name in names:
-        if names.count(name) > 1:
-            raise DesignError("unknowns", f"{name} twice", "each once")
-    return tuple(every)
-
-
-_COUNTING = ("gain_e_per_dn", "offset_dn", "exposure_ms", "quantum_efficiency", "ambient", "dark_current_e_s")
-
-
-def check_unknown(unknown: Unknown) -> None:
-    """Raise `DesignError` for an unknown whose effect on the pictures is not modelled."""
-    camera = unknown.name.removeprefix("camera.") if unknown.name.startswith("camera.") else None
-    flux = unknown.name.startswith("leds.") and unknown.name.endswith(".flux_W")
-    if not (touches_contact(unknown.name) or camera in _COUNTING or flux):
-        allowed = (
-            "size_mm, depth_mm, modulus_kPa, offset_x_mm, offset_y_mm, press.indentation_mm, "
-            "specimen.modulus_kPa, specimen.thickness_mm, specimen.poisson, surface.rms_slope, surface.kappa, "
-            f"waveguide.layers.N.modulus_kPa, leds.*.flux_W, camera.{', camera.'.join(_COUNTING)}"
-        )
-        raise DesignError("unknowns", shown(unknown.name), allowed)
-    if not 0 < unknown.sd < np.inf:
-        raise DesignError(f"unknowns.{unknown.name}.sd", shown(unknown.sd), "a number > 0")
-
-
 def check(layout: Layout, inclusions: Sequence[fem.Inclusion]) -> None:
     """Raise `DesignError` where a press of the protocol cannot be."""
     if not inclusions:
@@ -258,144 +211,6 @@ def check(layout: Layout, inclusions: Sequence[fem.Inclusion]) -> None:
         for x, y in layout.protocol.positions_mm:
             offset = (inclusion.offset[0] - x, inclusion.offset[1] - y)
             layout.design.check_inclusion(replace(inclusion, offset=offset))
-
-
-def optical_key(design: Design) -> tuple[Any, ...]:
-    """All of a sensor that its radiance depends on: not what the camera makes of it."""
-    camera = design.camera
-    seen = camera.rows, camera.columns, camera.field_of_view_mm, camera.distance_mm, camera.distortion
-    response = camera.quantum_efficiency if not isinstance(camera.quantum_efficiency, float) else None
-    sensor = design.sensor()
-    parts = sensor.guide, sensor.glass, sensor.leds, sensor.skin, sensor.tissue, sensor.effective_modulus_kPa
-    return (*seen, camera.colour, response, camera.pixel_um, design.light, *parts)
-
-
-@dataclass
-class _Work:
-    """The presses and the light of one layout."""
-
-    design: Design
-    unknowns: tuple[Unknown, ...]
-    emulator: Emulator | None
-    quality: str
-    seed: int
-    bench: Bench
-    seconds: dict[str, float]
-    ground: fem.Inclusion
-    """Whose mesh carries the press on plain tissue, where presses are solved."""
-
-    def __post_init__(self) -> None:
-        self.moving = [unknown for unknown in self.unknowns if touches_contact(unknown.name)]
-
-    def touch(self, inclusion: fem.Inclusion, level: float, place: tuple[float, float]) -> Touch:
-        """The contact, from before or computed now.
-
-        Every solve has its own mesh, whose error in the background would look like a signal: what the
-        inclusion adds on its mesh is added to the one background.
-        """
-        found = self._touch(inclusion, level, place)
-        if self.emulator is not None or (inclusion, place) == (self.ground, (0.0, 0.0)):
-            return found
-        ground = self._touch(self.ground, level, (0.0, 0.0))
-        slopes = {}
-        for name, slope in found.slopes.items():
-            plain = ground.slopes[name][1]
-            slopes[name] = np.stack([plain + (slope[0] - slope[1]), plain])
-        return Touch(ground.plain + (found.fields - found.plain), ground.plain, slopes, found.steps)
-
-    def _touch(self, inclusion: fem.Inclusion, level: float, place: tuple[float, float]) -> Touch:
-        """On its own mesh; a solved one serves at every level."""
-        began = time.perf_counter()
-        solved = self.emulator is None
-        names = [unknown.name for unknown in self.moving]
-        steps = {u.name: step_of(u, touches.value_of(self.design, inclusion, u.name)) for u in self.moving}
-
-        def make() -> Arrays:
-            at = 1.0 if solved else level
-            found = touches.touch(self.design, inclusion, at, place, self.moving, self.emulator)
-            slopes = [found.slopes[name] for name in names]
-            return {
-                "fields": found.fields,
-                "plain": found.plain,
-                "slopes": np.stack(slopes) if slopes else np.zeros((0, 2, *found.fields.shape), np.float32),
-            }
-
-        if solved:
-            self.design.check_indentation(level)
-        got = self.bench.kept.get(self._key("touch", inclusion, 0.0 if solved else level, place), make)
-        by = level if solved else 1.0
-        self.seconds["mechanics"] += time.perf_counter() - began
-        slopes = {name: by * slope for name, slope in zip(names, got["slopes"], strict=True)}
-        return Touch(by * got["fields"], by * got["plain"], slopes, steps)
-
-    def lit(self, inclusion: fem.Inclusion, level: float, place: tuple[float, float]) -> Lit:
-        """The light of a press, from before or computed now."""
-        names = tuple(unknown.name for unknown in self.moving)
-
-        def make() -> Arrays:
-            touch = self.touch(inclusion, level, place)
-            began = time.perf_counter()
-            found = self.lighting.lit(touch, level, self.moving)
-            self.seconds["light"] += time.perf_counter() - began
-            return {"layers": found.layers, "slopes": found.slopes}
-
-        got = self.bench.kept.get(self._light_key("lit", inclusion, level, place), make)
-        return Lit(got["layers"], got["slopes"], names)
-
-    def standard(self, level: float, near: fem.Inclusion) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Radiance of plain tissue, and with the standard lump at each depth, at one level."""
-        size, modulus = objectives.PRESSED
-
-        def make() -> Arrays:
-            touch = self.touch(near, level, (0.0, 0.0))
-            began = time.perf_counter()
-            lighting = self.lighting
-            if level not in lighting.levels:
-                lighting.lit(touch, level, ())
-            plain, lumps = lighting.plain(level), []
-            self.seconds["light"] += time.perf_counter() - began
-            for depth in self.depths():
-                ball = fem.Inclusion(size, depth, modulus)
-                lump = self.lump(ball, level)
-                began = time.perf_counter()
-                lumps.append(lighting.seen(lump, level))
-                self.seconds["light"] += time.perf_counter() - began
-            # as the lumps were made: with the light that was traced for plain tissue
-            return {"plain": plain.astype(np.float32), "lumps": np.stack(lumps).astype(np.float32)}
-
-        got = self.bench.kept.get(self._light_key("standard", near, level, (0.0, 0.0)), make)
-        return got["plain"], got["lumps"]
-
-    def depths(self) -> list[float]:
-        """Depths at which the standard lump is pressed, within the slab."""
-        size, deepest = objectives.PRESSED[0], self.design.specimen.thickness_mm
-        return [depth for depth in objectives.PRESSED_DEPTHS_MM if depth + size < 0.9 * deepest]
-
-    def lump(self, ball: fem.Inclusion, level: float) -> NDArray[Any]:
-        """Contact fields of an inclusion without any slopes."""
-        work = replace(self, unknowns=())
-        own = work._touch(ball, level, (0.0, 0.0))
-        if self.emulator is not None:
-            return own.fields
-        return self._touch(self.ground, level, (0.0, 0.0)).plain + (own.fields - own.plain)
-
-    @property
-    def lighting(self) -> Lighting:
-        plain = self._key("plain", self.ground, 0.0, (0.0, 0.0))
-        return self.bench.lighting(self.design, self.quality, self.seed, plain)
-
-    def _key(self, what: str, inclusion: fem.Inclusion, level: float, place: tuple[float, float]) -> Any:
-        design = self.design
-        known = None if self.emulator is None else (self.emulator.plan, float(self.emulator.pressure.sum()))
-        felt = design.effective_modulus_kPa, design.surface.rms_slope, design.surface.kappa
-        bodies = design.probe(), design.slab(), inclusion, design.mechanics if known else "linear"
-        return what, 1, bodies, felt, known, level, place, self.moving
-
-    def _light_key(
-        self, what: str, inclusion: fem.Inclusion, level: float, place: tuple[float, float]
-    ) -> Any:
-        own = optical_key(self.design), self.quality, self.seed, self.bench.samples
-        return self._key(what, inclusion, level, place), own, self.ground
 
 
 def _judged(
@@ -436,9 +251,9 @@ def _judged(
     names = tuple(unknown.name for unknown in unknowns)
     told = inform(names, pictures, np.array([unknown.sd for unknown in unknowns]))
     sd = dict(zip(names, map(float, bound(told).sd), strict=True))
-    single = np.float32
-    mean, layers = counted.mean.astype(single), counted.layers.astype(single)
-    return Judged(inclusion, mean, layers, names, jacobian, by_layer, told, sd)
+    mean: Singles = counted.mean.astype(np.float32)
+    seen: Singles = counted.layers.astype(np.float32)
+    return Judged(inclusion, mean, seen, names, jacobian, by_layer, told, sd)
 
 
 def noises_of(design: Design, block: float, protocol: Protocol) -> tuple[Any, Any]:
@@ -472,7 +287,7 @@ def _camera_slope(design: Design, radiance: NDArray[Any], unknown: Unknown) -> t
     return layers, whole - np.where(both, layers.sum(axis=-planes - 1), 0.0)
 
 
-def _detection(work: _Work, protocol: Protocol, judged: Judged, block: float, near: fem.Inclusion) -> float:
+def _detection(work: Work, protocol: Protocol, judged: Judged, block: float, near: fem.Inclusion) -> float:
     """Depth at which the standard lump is found by all levels at the first place."""
     design, depths = work.design, work.depths()
     if len(depths) < 2:

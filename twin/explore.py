@@ -7,32 +7,28 @@ what a dead one had under way is found by that and tried again.
 
 from __future__ import annotations
 
-import fcntl
-import hashlib
-import itertools
 import json
 import os
 import shutil
-import socket
 import uuid
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 import fem
 from scenes.sensor import NotModelled
 from twin import evaluate as judging
-from twin import explored, layout_fields, presses
+from twin import explored, layout_fields, presses, proposals
+from twin.alive import alive, locked
 from twin.complaint import DesignError, shown
 from twin.design import Design, load_design, shipped_designs
 from twin.evaluate import Bench, Evaluation, Layout
 from twin.kept import Kept
 from twin.layout_study import Axis, LayoutStudy, Limit, Source, limits, load, parse
+from twin.proposals import distributions, grid_size, sampler
 
 if TYPE_CHECKING:
     import optuna
@@ -148,7 +144,7 @@ def checked(source: Source, trials: int | None, emulator: str | Path | None) -> 
         for field, one in axes.items():
             _possible(study, design, field, one)
         file = _emulator(source, design, emulator, axes)
-        whole = _grid_size(axes, study, design)
+        whole = grid_size(axes, study, design)
     except DesignError as error:
         raise error.renamed(source=error.source or source.name) from None
     number = trials or study.search.trials or whole
@@ -226,39 +222,6 @@ def opened(exploration: Exploration) -> optuna.Study:
         raise DesignError("--storage", f"{exploration.url} ({reason})", allowed) from None
 
 
-def sampler(study: LayoutStudy, number: int) -> optuna.samplers.BaseSampler:
-    """What chooses the layout of this number: its draws depend on the seed, the number and what is known."""
-    import optuna
-
-    told = hashlib.sha256(repr((study.seed, number)).encode()).digest()
-    seed = int.from_bytes(told[:4], "little")
-    if study.search.method == "nsga2":
-        return optuna.samplers.NSGAIISampler(
-            population_size=study.search.population, seed=seed, constraints_func=_constraints
-        )
-    if study.search.method == "tpe":
-        return optuna.samplers.TPESampler(seed=seed, multivariate=True, constraints_func=_constraints)
-    return optuna.samplers.RandomSampler(seed=seed)
-
-
-def distributions(exploration: Exploration) -> dict[str, optuna.distributions.BaseDistribution]:
-    """What Optuna knows of the fields."""
-    from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
-
-    found: dict[str, optuna.distributions.BaseDistribution] = {}
-    for name, one in exploration.axes.items():
-        if one.choices is not None:
-            found[name] = CategoricalDistribution([layout_fields.said(choice) for choice in one.choices])
-            continue
-        assert one.range is not None
-        low, high = one.range
-        if layout_fields.whole(name, exploration.design):
-            found[name] = IntDistribution(int(low), int(high), log=one.log)
-        else:
-            found[name] = FloatDistribution(low, high, log=one.log)
-    return found
-
-
 def work(
     exploration: Exploration,
     *,
@@ -273,7 +236,7 @@ def work(
         emulator = presses.emulator_of(exploration.design, exploration.emulator)
     options = {"emulator": emulator, "bench": bench, "evaluate": evaluate}
     tried = 0
-    with alive(exploration) as me:
+    with alive(exploration.folder / WORKERS) as me:
         with locked(exploration.folder / WORKERS / "baseline.lock", wait=False) as mine:
             if mine and explored.read(exploration.folder / BASELINE) is None:
                 base = layout_fields.base(exploration.study, exploration.design)
@@ -309,7 +272,7 @@ def _next(exploration: Exploration, optuna_study: optuna.Study, me: str) -> optu
         if now.done + now.running >= exploration.trials:
             return None
         optuna_study.sampler = sampler(exploration.study, now.done + now.running)
-        trial = optuna_study.ask(distributions(exploration))
+        trial = optuna_study.ask(distributions(exploration.axes, exploration.design))
         trial.set_user_attr("worker", me)
         return trial
 
@@ -373,7 +336,7 @@ def _try(exploration: Exploration, optuna_study: optuna.Study, trial: optuna.Tri
 
 def _evaluated(exploration: Exploration, layout: Layout, **options: Any) -> Evaluation:
     study, evaluate = exploration.study, options.pop("evaluate")
-    return evaluate(  # type: ignore[no-any-return]
+    return evaluate(
         layout,
         study.balls(),
         study.unknown(),
@@ -384,8 +347,9 @@ def _evaluated(exploration: Exploration, layout: Layout, **options: Any) -> Eval
     )
 
 
-def _constraints(trial: optuna.trial.FrozenTrial) -> list[float]:
-    return list(trial.user_attrs.get("constraints", ()))
+def planned(exploration: Exploration) -> Iterator[dict[str, layout_fields.Value]]:
+    """The layouts of a grid or of a Latin hypercube."""
+    return proposals.planned(exploration.study, exploration.axes, exploration.design, exploration.trials)
 
 
 def _enqueue(exploration: Exploration, optuna_study: optuna.Study) -> None:
@@ -399,84 +363,6 @@ def _enqueue(exploration: Exploration, optuna_study: optuna.Study) -> None:
         for number, values in enumerate(planned(exploration)):
             if number not in there:
                 optuna_study.enqueue_trial(values, user_attrs={"planned": number})
-
-
-def planned(exploration: Exploration) -> Iterator[dict[str, layout_fields.Value]]:
-    """The layouts of a grid, the first field slowest, or of a Latin hypercube, as many as are wanted."""
-    axes, study, design = exploration.axes, exploration.study, exploration.design
-    if study.search.method == "grid":
-        each = [_points(one, layout_fields.whole(name, design)) for name, one in axes.items()]
-        for values in itertools.islice(itertools.product(*each), exploration.trials):
-            yield dict(zip(axes, values, strict=True))
-        return
-    from scipy.stats import qmc
-
-    count = study.search.trials or exploration.trials
-    drawn = qmc.LatinHypercube(len(axes), rng=np.random.default_rng(study.seed)).random(count)
-    for row in drawn[: exploration.trials]:
-        yield {
-            name: _at(one, layout_fields.whole(name, design), float(share))
-            for (name, one), share in zip(axes.items(), row, strict=True)
-        }
-
-
-def _at(one: Axis, integer: bool, share: float) -> layout_fields.Value:
-    """The value at a share, 0 to 1, of a field's range or of its choices."""
-    if one.choices is not None:
-        return layout_fields.said(one.choices[min(int(share * len(one.choices)), len(one.choices) - 1)])
-    assert one.range is not None
-    low, high = one.range
-    if integer:
-        return int(min(low + int(share * (high - low + 1)), high))
-    if one.log:
-        return float(low * (high / low) ** share)
-    return float(low + share * (high - low))
-
-
-def _points(one: Axis, integer: bool) -> list[layout_fields.Value]:
-    """The values of a field in a grid."""
-    if one.choices is not None:
-        return [layout_fields.said(choice) for choice in one.choices]
-    assert one.range is not None
-    low, high = one.range
-    values = np.geomspace(low, high, one.points) if one.log else np.linspace(low, high, one.points)
-    if integer:
-        return sorted({round(value) for value in values})
-    return [float(value) for value in values]
-
-
-def _grid_size(axes: Mapping[str, Axis], study: LayoutStudy, design: Design) -> int:
-    sizes = [len(_points(one, layout_fields.whole(name, design))) for name, one in axes.items()]
-    total = int(np.prod([float(size) for size in sizes]))
-    if study.search.method == "grid" and total > 100_000:
-        raise DesignError("fields", f"{total} combinations", "at most 100000 in a grid")
-    return total
-
-
-@contextmanager
-def alive(exploration: Exploration) -> Iterator[str]:
-    """Hold a lock that says that this process works; yields its name."""
-    name = f"{socket.gethostname()}-{os.getpid()}-{uuid.uuid4().hex[:6]}"
-    file = exploration.folder / WORKERS / f"{name}.lock"
-    with locked(file):
-        yield name
-    # the file stays: without it a trial of this worker could not be told from one of another machine
-
-
-@contextmanager
-def locked(file: Path, wait: bool = True) -> Iterator[bool]:
-    """Hold a file's lock; yields whether it is held, which without waiting it may not be."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    handle = os.open(file, os.O_RDWR | os.O_CREAT, 0o644)
-    try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-        except BlockingIOError:
-            yield False
-            return
-        yield True
-    finally:
-        os.close(handle)
 
 
 def _replace(path: Path, text: str) -> None:

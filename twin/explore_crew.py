@@ -129,7 +129,8 @@ def planned(exploration: Exploration, cost: Cost, workers: int) -> str:
     }
     width = max(len(name) for name in kinds)
     lines = [
-        f"{study.name}: {exploration.trials} layouts by {study.search.method}, {len(study.inclusions)} inclusions"
+        f"{study.name}: {exploration.trials} layouts by {study.search.method}, "
+        f"{len(study.inclusions)} inclusions"
     ]
     lines += [f"  {name:<{width}}  {kind:<10}  {said[kind]}" for name, kind in kinds.items()]
     worst = next(kind for kind in ("mechanical", "optical", "camera") if kind in kinds.values())

@@ -1,4 +1,4 @@
-"""What a person sees of a corpus or an exploration while it is being run: a bar on a terminal, else a line now and then."""
+"""What a person sees of a long run: a bar on a terminal, else a line now and then."""
 
 from __future__ import annotations
 

@@ -168,7 +168,7 @@ class Lighting:
         from scenes import tangent
         from scenes.render import PATHS_PER_LED
 
-        whole, found = self.samples or PATHS_PER_LED[self.quality], []  # type: ignore[index]
+        whole, found = self.samples or PATHS_PER_LED[self.quality], []
         for number, (renderer, band) in enumerate(zip(self._renderers(), self._spectral.bands, strict=True)):
             seed = (self.seed + number * _SEED_STEP) % _SEEDS if number else self.seed
             paths = max(whole // band.parts, 2)
@@ -185,4 +185,4 @@ class Lighting:
             tangent.picture(renderer, shape, straight[number], traced[number])
             for number, renderer in enumerate(renderers)
         ]
-        return spectral.together(each)  # type: ignore[no-any-return]
+        return np.asarray(spectral.together(each))

@@ -49,7 +49,7 @@ def said(value: Any) -> Value:
     """Return a value as Optuna and `Layout.values` hold it: lists and tables as JSON text."""
     if isinstance(value, list | tuple | dict) or value is None or isinstance(value, bool):
         return json.dumps(value, sort_keys=True)
-    return value  # type: ignore[no-any-return]
+    return value
 
 
 def meant(name: str, value: Value, choices: Sequence[Any] | None) -> Any:
@@ -80,9 +80,9 @@ def axes(study: LayoutStudy, design: Design) -> dict[str, Axis]:
                 raise DesignError(where, "a range", "{choices = [...]}")
         elif name not in (*SPECIAL, *PROTOCOL):
             _paths(tables, name.split("."), where, name)
-        if one.range is not None and whole(name, design):
-            if not all(float(end).is_integer() for end in one.range):
-                raise DesignError(where, shown(list(one.range)), "whole numbers")
+        ends = one.range if one.range is not None and whole(name, design) else ()
+        if not all(float(end).is_integer() for end in ends):
+            raise DesignError(where, shown(list(ends)), "whole numbers")
     for name in study.set:
         if name not in SPECIAL:
             _paths(tables, name.split("."), f"set.{name}", name)

@@ -134,7 +134,8 @@ class LayoutStudy:
         for number, one in enumerate(self.inclusions):
             values = {"size": one.size_mm, "depth": one.depth_mm, "modulus": one.modulus_kPa}
             try:
-                found.append(fem.Inclusion(**values, offset=(one.offset_x_mm, one.offset_y_mm)))
+                place = one.offset_x_mm, one.offset_y_mm
+                found.append(fem.Inclusion(one.size_mm, one.depth_mm, one.modulus_kPa, place))
             except ValidationError as error:
                 what = from_validation(error, values, TypeAdapter(fem.Inclusion).json_schema())
                 raise what.renamed(f"inclusions.{number}.{what.field}") from None

@@ -116,7 +116,7 @@ def deflection_of(
     nuisances: Sequence[Floats],
     prior: Floats,
 ) -> float:
-    """Deflection d' of a lump in all pictures together, the nuisances projected out as far as their priors leave room.
+    """Deflection d' of a lump in all pictures, nuisances projected out as far as their priors leave room.
 
     Parameters
     ----------

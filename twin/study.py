@@ -1,6 +1,6 @@
 """A study of kind "corpus": what is sampled and randomised, as a frozen, checked value from a TOML file.
 
-For a study of kind "layout", which compares sensors, see `twin.layout_study`. Fields, defaults and an example: CORPORA.md.
+Fields, defaults and an example: CORPORA.md. `twin.layout_study` has the other kind, which compares sensors.
 """
 
 from __future__ import annotations

@@ -117,29 +117,27 @@ def _emulated(
         if unknown.name in _SKIN:
             found[unknown.name] = _skin(unknown, value, middle)
             continue
-        found[unknown.name] = _central(
-            lambda to, name=unknown.name: fields({name: to}), unknown, value, step, middle
-        )
+        found[unknown.name] = _central(fields, unknown, value, step, middle)
     return Touch(*middle, found, steps)
 
 
 def _central(
-    fields: Callable[[float], tuple[Floats, Floats]],
+    fields: Callable[[dict[str, float]], tuple[Floats, Floats]],
     unknown: Unknown,
     value: float,
     step: float,
     middle: tuple[Floats, Floats],
 ) -> NDArray[np.float32]:
     """Slope by a central difference; at the edge of what the emulator knows by three points on one side."""
-    low, high = _ends(unknown, value, step)
+    (low, high), name = _ends(unknown, value, step), unknown.name
     try:
-        return _difference(fields(high), fields(low), step)
+        return _difference(fields({name: high}), fields({name: low}), step)
     except fem.NotModelled:
-        farther = _ends(unknown, value, 2.0 * step)
+        lower, higher = _ends(unknown, value, 2.0 * step)
         try:
-            one, two, sign = fields(low), fields(farther[0]), 1.0
+            one, two, sign = fields({name: low}), fields({name: lower}), 1.0
         except fem.NotModelled:
-            one, two, sign = fields(high), fields(farther[1]), -1.0
+            one, two, sign = fields({name: high}), fields({name: higher}), -1.0
         slope = sign * (3.0 * np.stack(middle) - 4.0 * np.stack(one) + np.stack(two)) / (2.0 * step)
         return np.asarray(slope, np.float32)
 
@@ -245,7 +243,7 @@ def _both(design: Design, there: Design, surface: Any) -> tuple[Floats, Floats]:
 
 
 def _difference(high: Sequence[Floats], low: Sequence[Floats], step: float) -> NDArray[np.float32]:
-    return ((np.stack(high) - np.stack(low)) / (2.0 * step)).astype(np.float32)  # type: ignore[no-any-return]
+    return ((np.stack(high) - np.stack(low)) / (2.0 * step)).astype(np.float32)
 
 
 def _skin(unknown: Unknown, value: float, middle: tuple[Floats, Floats]) -> NDArray[np.float32]:
