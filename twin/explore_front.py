@@ -16,15 +16,15 @@ from twin.explore_results import Results, Trial
 from twin.objectives import OBJECTIVES
 from twin.report import BLUE, GREY, INK, RED, digits, plainly
 
-_WIDTH, _HEIGHT = 620, 400
+_WIDTH, _HEIGHT = 620, 350
 _LEFT, _RIGHT, _TOP, _BOTTOM = 64, 14, 14, 50
 
 _STYLE = f"""\
 .front {{ display: flex; gap: 1.2rem; align-items: flex-start; flex-wrap: wrap; }}
 .front svg {{ width: {_WIDTH}px; max-width: 100%; height: auto; }}
 .front .side {{ flex: 1 1 320px; min-width: 300px; font-size: .88rem; }}
-.front select {{ font: inherit; font-size: .88rem; width: 17rem; }}
-.front label {{ font-size: .88rem; margin-right: .8rem; color: #555; }}
+#front select {{ font: inherit; font-size: .88rem; width: 18.5rem; }}
+#front label {{ font-size: .88rem; margin-right: .8rem; color: #555; }}
 .front circle {{ cursor: pointer; }}
 .front circle:focus-visible {{ outline: 2px solid {INK}; outline-offset: 2px; }}
 .front h3 {{ margin: 0 0 .3rem; font-size: 1rem; }}
@@ -51,6 +51,7 @@ _SCRIPT = """\
     return node;
   }
   function short(value) {
+    if (value === undefined || value === null) return '\\u2014';
     if (typeof value !== 'number') return String(value);
     if (value === 0) return '0';
     var size = Math.abs(value);
@@ -111,11 +112,15 @@ _SCRIPT = """\
         trial.name);
     });
   }
-  function table(title, rows) {
+  function table(head, rows) {
     var box = document.createElement('table'), body = document.createElement('tbody');
-    var caption = document.createElement('caption');
-    caption.textContent = title;
-    box.appendChild(caption);
+    var top = document.createElement('tr');
+    head.forEach(function (cell) {
+      var node = document.createElement('th');
+      node.textContent = cell;
+      top.appendChild(node);
+    });
+    body.appendChild(top);
     rows.forEach(function (row) {
       var line = document.createElement('tr');
       row.forEach(function (cell) {
@@ -136,15 +141,12 @@ _SCRIPT = """\
     var title = document.createElement('h3');
     title.textContent = trial.name + (trial.rank === 1 ? ', on the front' : '');
     side.appendChild(title);
-    side.appendChild(table('what it took, and the baseline', Object.keys(trial.values).map(function (name) {
-      var before = data.trials[0].values[name];
-      return [name, short(trial.values[name]), before === undefined ? '' : short(before)];
-    })));
-    side.appendChild(table('what it gives, and the baseline', data.shown.map(function (name) {
-      var value = trial.objectives[name], before = data.trials[0].objectives[name];
-      return [data.words[name], value === undefined ? '\\u2014' : short(value),
-        before === undefined ? '' : short(before)];
-    })));
+    var base = data.trials[0];
+    function both(name, part) { return [short(trial[part][name]), short(base[part][name])]; }
+    side.appendChild(table(['what it took', trial.name, 'baseline'],
+      Object.keys(trial.values).map(function (name) { return [name].concat(both(name, 'values')); })));
+    side.appendChild(table(['what it gives', trial.name, 'baseline'],
+      data.shown.map(function (name) { return [data.words[name]].concat(both(name, 'objectives')); })));
     draw();
   }
   function fromAddress() { if (location.hash.length > 1) choose(location.hash.slice(1)); }

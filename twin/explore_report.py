@@ -76,7 +76,7 @@ def page(results: Results) -> Page:
     _best(made, results, [results.baseline, *best])
     _known(made, results, [results.baseline, *best])
     if mattered:
-        _mattered(made, mattered)
+        _mattered(made, mattered, len(results.trials))
     _leds(made, [results.baseline, *best[:1]])
     _designs(made, results, best)
     _limits(made, results)
@@ -131,7 +131,7 @@ def _why(results: Results, top: Trial, mattered: Sequence[Importance]) -> str:
         one = mattered[0]
         leading = sorted(one.share.items(), key=lambda item: -item[1])[:2]
         said = ", then ".join(f"{name} ({100 * share:.0f} %)" for name, share in leading)
-        parts.append(f"What moves it most is {said}")
+        parts.append(f"what moves it most is {said}")
     compared = [
         f"{words} {digits(top.objectives[name])} (baseline {digits(results.baseline.objectives[name])})"
         for name, words in (("snr", "tared signal over noise"), ("led_power_W", "LED flux, W"))
@@ -245,13 +245,14 @@ def _budget_rows(budgets: Sequence[Sequence[Budget]]) -> list[list[str]]:
     return rows
 
 
-def _mattered(made: Page, mattered: Sequence[Importance]) -> None:
+def _mattered(made: Page, mattered: Sequence[Importance], count: int) -> None:
     made.section("Fields that mattered")
     ways = "; ".join(dict.fromkeys(one.way for one in mattered))
+    chance = 100.0 / np.sqrt(count)
     made.figure(
         figures.importance(mattered),
         "Share of each field in how far the objective varies over the layouts that were tried: "
-        f"{ways}. It says nothing outside the ranges of the study.",
+        f"{ways}. Nothing is said outside the study's ranges; shares below {chance:.0f} % may be chance.",
     )
 
 
@@ -263,7 +264,7 @@ def _leds(made: Page, shown: Sequence[Trial]) -> None:
     made.section("LED by LED")
     for one, found in told:
         names = found["names"]
-        head = ["setting", "times the design's flux", "W", "brightest, %"]
+        head = ["setting", "times the design's flux", "W at once", "brightest, %"]
         head += [f"bound on {_SYMBOLS[name][0]}, {_SYMBOLS[name][1]}" for name in names]
         rows = [
             [
@@ -280,7 +281,12 @@ def _leds(made: Page, shown: Sequence[Trial]) -> None:
         low, high = found["binning"]
         spread = [f"{digits(a)} to {digits(b)}" for a, b in zip(low, high, strict=True)]
         rows.append([f"bin of ± {100 * found['tolerance']:.0f} %, 9 of 10 sensors", "", "", "", *spread])
-        made.table(head, rows, f"{one.name}: light is linear, so no picture was rendered for these.")
+        made.table(
+            head,
+            rows,
+            f"{one.name}: light is linear, so no picture was rendered for these. Brightest: a pixel over "
+            "what the camera takes, less four standard deviations; fluxes, other than drift, are known.",
+        )
 
 
 def _designs(made: Page, results: Results, best: Sequence[Trial]) -> None:

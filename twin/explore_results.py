@@ -140,9 +140,16 @@ def read(folder: str | Path) -> Results:
         if (one / "evaluation.json").is_file():  # the last file to appear
             every.append(_trial(one, int(one.name)))
     used = {"protocol": baseline.told.get("protocol", {})}
+    layers = given.get("waveguide", {}).get("layers", [])
+    whole = {
+        "leds": len(given.get("leds", [])),
+        "power_W": sum(led.get("flux_W", 0.0) for led in given.get("leds", [])),
+        "sheet_mm": given.get("surface", {}).get("sheet", {}).get("thickness_mm", 0.0),
+        "layers": [[layer.get("thickness_mm"), layer.get("modulus_kPa")] for layer in layers],
+    }
     own: dict[str, Value] = {}
     for name in study.get("fields", {}):
-        value = _given(given | used, str(name).split("."))
+        value = _given(given | used | {"layout": whole}, str(name).split("."))
         if value is not None:
             own[name] = value
     baseline = replace(baseline, values=own | baseline.values)
