@@ -12,9 +12,14 @@ NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome", "chromium-he
 LAPTOP = (1366, 768)
 
 
+def found() -> str | None:
+    """The browser, None where there is none."""
+    return next(filter(None, map(shutil.which, NAMES)), None)
+
+
 def run(page: Path, *flags: str, at: str = "") -> tuple[str, list[str]]:
     """Open a page from its file; return what the browser prints, and what the page said on its console."""
-    browser = next(filter(None, map(shutil.which, NAMES)), None)
+    browser = found()
     if browser is None:
         pytest.skip("no Chromium on this machine (Debian: apt-get install chromium)")
     done = subprocess.run(
