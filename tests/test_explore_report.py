@@ -134,6 +134,12 @@ def test_a_browser_shows_it(study: Path, tmp_path: Path) -> None:
     assert drawn.count("<circle") == len(results.trials) + 1
 
 
+def test_a_study_without_a_layout_says_so(tmp_path: Path) -> None:
+    folder = write_study(tmp_path / "none", trials=2)
+    text = explore_report.write(folder).read_text(encoding="utf-8")
+    assert "No layout could be judged" in text and "9 &lt;mm&gt;" in text
+
+
 def test_folders_that_are_none_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DesignError, match=r"DIR: received .*; allowed a folder of `twin explore`"):
         explore_report.write(tmp_path)

@@ -133,8 +133,8 @@ def _why(results: Results, top: Trial, mattered: Sequence[Importance]) -> str:
         said = ", then ".join(f"{name} ({100 * share:.0f} %)" for name, share in leading)
         parts.append(f"what moves it most is {said}")
     compared = [
-        f"{words} {digits(top.objectives[name])} (baseline {digits(results.baseline.objectives[name])})"
-        for name, words in (("snr", "tared signal over noise"), ("led_power_W", "LED flux, W"))
+        f"{words} {digits(top.objectives[name])}{unit} (baseline {digits(results.baseline.objectives[name])})"
+        for name, words, unit in (("snr", "tared signal over noise", ""), ("led_power_W", "LED flux", " W"))
         if name in top.objectives and name in results.baseline.objectives
     ]
     return "Why: " + "; ".join(filter(None, [*parts, ", ".join(compared)])) + "."
@@ -197,6 +197,8 @@ def _best(made: Page, results: Results, shown: Sequence[Trial]) -> None:
         "the same scale in each column.",
         pixels=True,
     )
+    if not any(name in figures.UNITS for name in trials[0].told["inclusions"][0]["sd"]):
+        return
     made.figure(
         figures.bounds(trials),
         "Prior-included bound on each inclusion; the others of the unknowns are unknown within their priors.",
@@ -207,11 +209,13 @@ def _known(made: Page, results: Results, shown: Sequence[Trial]) -> None:
     made.section("Costs and detection")
     told = [one for one in shown[:2] if _has_budget(one)]
     if told:
+        known = told[0].budgets()[0].wanted
+        wanted = "modulus_kPa" if "modulus_kPa" in known else known[-1]
         made.figure(
-            figures.budget(told),
-            "Error budget of E: what a bound loses when one of the unknowns becomes known, exactly (grey) or "
-            "twice as well as now (colour): the calibration, or the averaging, that would buy most stands on "
-            "top. The unknowns share what they cost: the bars do not add up.",
+            figures.budget(told, wanted),
+            f"Error budget of {_SYMBOLS[wanted][0]}: what a bound loses when one of the unknowns becomes known, "
+            "exactly (grey) or twice as well as now (colour): the calibration, or the averaging, that would buy "
+            "most stands on top. The unknowns share what they cost: the bars do not add up.",
         )
         budgets = [one.budgets() for one in told]
         made.table(

@@ -79,7 +79,7 @@ class Trial:
         """The error budget of d, h and E (of those that are asked for) for each inclusion."""
         found = self.informations()
         wanted = [name for name in WANTED if name in found[0].names]
-        return [error_budget(one, wanted) for one in found]
+        return [error_budget(one, wanted) for one in found] if wanted else []
 
 
 @dataclass(frozen=True)
