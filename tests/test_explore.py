@@ -16,7 +16,7 @@ import pytest
 
 import fem
 from estimation.information import Information
-from twin import explore, explored, objectives
+from twin import explore, explore_words, explored, objectives
 from twin.complaint import DesignError
 from twin.evaluate import Evaluation, Judged, Layout
 from twin.forward import Unknown
@@ -109,7 +109,7 @@ def test_every_search_records_all_layouts(tmp_path: Path, method: str) -> None:
             assert one["objectives"]["bound_modulus_kPa"] == pytest.approx(1.0 / (power * count))
     base = explored.read(found.folder / "baseline")
     assert base is not None and base["state"] == "complete"
-    assert len(explore.findings(found)) == 2
+    assert len(explore_words.findings(found)) == 2
     for place in (found.folder / "trials").iterdir():
         if explored.read(place)["state"] == "complete":  # type: ignore[index]
             with np.load(place / "pictures.npz", allow_pickle=False) as data:

@@ -45,7 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
         if getattr(arguments, flag) == 0:
             raise DesignError(f"--{flag}", "0", "an integer > 0")
     workers = arguments.workers or os.cpu_count() or 1
-    from twin import explore, explore_crew
+    from twin import explore, explore_crew, explore_words
     from twin.layout_study import load
 
     if arguments.plan:
@@ -73,8 +73,10 @@ def run(arguments: argparse.Namespace) -> int:
             tell.close()
             print("twin explore: interrupted; what is finished stays, run again continues", file=sys.stderr)
             return 130
+    if state.done >= state.wanted:
+        explore.clean(found)
     print(f"{state.complete} layouts judged, {state.infeasible} that cannot be: {arguments.out}")
-    for line in explore.findings(found):
+    for line in explore_words.findings(found):
         print(line)
     try:
         from twin import explore_report
