@@ -213,9 +213,9 @@ def _known(made: Page, results: Results, shown: Sequence[Trial]) -> None:
         wanted = "modulus_kPa" if "modulus_kPa" in known else known[-1]
         made.figure(
             figures.budget(told, wanted),
-            f"Error budget of {_SYMBOLS[wanted][0]}: what a bound loses when one of the unknowns becomes known, "
-            "exactly (grey) or twice as well as now (colour): the calibration, or the averaging, that would buy "
-            "most stands on top. The unknowns share what they cost: the bars do not add up.",
+            f"Error budget of {_SYMBOLS[wanted][0]}: what a bound loses when one of the unknowns becomes "
+            "known, exactly (grey) or twice as well as now (colour): the calibration, or the averaging, that "
+            "would buy most stands on top. The unknowns share what they cost: the bars do not add up.",
         )
         budgets = [one.budgets() for one in told]
         made.table(
