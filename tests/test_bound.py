@@ -123,6 +123,7 @@ def judge(found: dict[str, Any], label: str) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 @pytest.mark.parametrize(
     ("label", "made", "frames"),
     [
@@ -141,6 +142,7 @@ def test_maximum_likelihood_reaches_the_bound(
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 def test_the_maximum_of_the_posterior_reaches_the_bound_with_prior(emulator: fem.Emulator) -> None:
     """A faint inclusion, coarse pixels, a light press, one frame: pictures alone leave log E at over 0.2."""
     found = spread(small(), 1, BOXED + NUISANCES, emulator, FAINT, 1.0)
@@ -149,6 +151,7 @@ def test_the_maximum_of_the_posterior_reaches_the_bound_with_prior(emulator: fem
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 def test_derivatives_agree_with_other_steps(emulator: fem.Emulator) -> None:
     """Half the step, every unknown: within 2 % of the Jacobian, rms over both pictures.
 
@@ -178,6 +181,7 @@ def test_derivatives_agree_with_other_steps(emulator: fem.Emulator) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 def test_bounds_hardly_know_of_the_light_s_noise(emulator: fem.Emulator) -> None:
     """Twice the light paths, and another seed: bounds on d, h and E within 5 %."""
     from twin.evaluate import Bench, Layout, Protocol, evaluate

@@ -186,6 +186,7 @@ def test_slopes_that_the_layers_do_not_hold_are_refused() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)
 def test_re_weighting_is_what_evaluating_anew_finds(variant: str) -> None:
     """Real light, presses solved: four other fluxes, every bound within 0.2 %, pictures within 1e-4."""
     from twin.evaluate import Bench, Layout, Protocol, evaluate
