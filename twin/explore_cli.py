@@ -73,14 +73,13 @@ def run(arguments: argparse.Namespace) -> int:
             tell.close()
             print("twin explore: interrupted; what is finished stays, run again continues", file=sys.stderr)
             return 130
-    if state.done >= state.wanted:
-        explore.clean(found)
     print(f"{state.complete} layouts judged, {state.infeasible} that cannot be: {arguments.out}")
     for line in explore_words.findings(found):
         print(line)
-    try:
-        from twin import explore_report
-    except ImportError:
-        return 0
-    print(f"look at: {explore_report.write(found.folder)}")
+    from twin import explore_report
+
+    if state.complete:
+        print(f"look at: {explore_report.write(found.folder)}")
+    if state.done >= state.wanted:  # the report uses what is kept
+        explore.clean(found)
     return 0
