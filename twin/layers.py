@@ -127,10 +127,11 @@ class Lighting:
 
     def _place(self, touch: Touch, level: float, moving: Sequence[Unknown]) -> _Place:
         if level not in self._places:
-            from scenes import tangent
+            renderers = self._renderers()
+            from scenes import tangent  # only now: see scenes.backend
 
             shape = surface_of(self.design, touch.plain)
-            straight = [tangent.gathered(renderer, shape) for renderer in self._renderers()]
+            straight = [tangent.gathered(renderer, shape) for renderer in renderers]
             traced = self._traced(shape, straight)
             self._places[level] = _Place(straight, traced, self._picture(shape, straight, traced))
         place = self._places[level]
