@@ -25,12 +25,14 @@ _MOST_LEDS = 16
 
 
 def findings(evaluation: Evaluation) -> dict[str, Any] | None:
-    """Return settings of the LEDs and what each is worth; None where the layers' slopes were not kept.
+    """Return settings of the LEDs and what each is worth; None where there is nothing to re-weight by.
 
     Bounds are root mean squares over the inclusions, of `lamps.WANTED` (those that are unknown), in order.
     """
     names = tuple(name for name in lamps.WANTED if name in evaluation.judged[0].names)
     if any(one.layer_jacobian is None for one in evaluation.judged) or not names:
+        return None
+    if set(evaluation.judged[0].names) <= set(lamps.WANTED):  # re-weighting wants a nuisance
         return None
     given = lamps.lamps_of(evaluation)
     count = given[0].count

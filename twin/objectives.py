@@ -128,6 +128,8 @@ def deflection_of(
     weight = np.concatenate(
         [signal_weight(a, b, n).ravel() for a, b, n in zip(mean_0, mean_1, noises, strict=True)]
     )
+    if not prior.size:
+        return deflection(signal, weight)
     jacobian = np.concatenate([one.reshape(len(prior), -1) for one in nuisances], axis=1)
     return deflection(signal, weight, jacobian, np.diag(1.0 / prior**2))
 
