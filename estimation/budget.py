@@ -76,6 +76,25 @@ def error_budget(information: Information, wanted: Sequence[str]) -> Budget:
 def _noise(information: Information, wanted: tuple[str, ...], sd: Floats, best: Floats) -> Cost:
     """That of the pictures' noise: with half of it, four times the information."""
     halved = bound(replace(information, fisher=4.0 * information.fisher), wanted).sd
-    # A limit, not infinity: 1e8 times the frames leave 1e-4 of the noise and a matrix that can be inverted.
-    known = bound(replace(information, fisher=1e8 * information.fisher), wanted).sd
+    known = np.minimum(_without_noise(information, wanted), sd)
     return Cost("noise", known, halved, best, sd - known)
+
+
+def _without_noise(information: Information, wanted: tuple[str, ...]) -> Floats:
+    """Bound with a millionth of the noise's variance: a limit, so that everything can be inverted.
+
+    In units of the prior, where there is one for all: what pictures cannot tell apart, as a gain and the flux
+    of all LEDs, is then left at the prior instead of lost in rounding.
+    """
+    prior, more = information.prior, 1e6
+    scale = np.sqrt(np.diag(prior))
+    if not (scale > 0).all():
+        return bound(replace(information, fisher=more * information.fisher), wanted).sd
+    unit = np.outer(scale, scale)
+    root = np.linalg.cholesky(prior / unit)
+    told = np.linalg.solve(root, np.linalg.solve(root, information.fisher / unit).T)
+    value, vector = np.linalg.eigh(0.5 * (told + told.T))
+    value[value < 1e-14 * len(value) * value[-1]] = 0.0
+    back = np.linalg.solve(root.T, vector) / scale[:, None]
+    at = information.index(wanted)
+    return np.asarray(np.sqrt((back[at] ** 2 / (1.0 + more * value)).sum(axis=1)))

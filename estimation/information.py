@@ -131,7 +131,7 @@ def fisher(jacobian: ArrayLike, weight: ArrayLike) -> Floats:
         raise ValueError(
             f"jacobian: received shape {slopes.shape}; allowed (parameters, *{weights.shape}), as the mean"
         )
-    flat = slopes.reshape(len(slopes), -1)
+    flat = slopes.reshape(len(slopes), weights.size)
     found = (flat * weights.ravel()) @ flat.T
     return np.asarray(0.5 * (found + found.T))
 

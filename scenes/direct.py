@@ -52,8 +52,23 @@ class _Path:
     in_glass: mi.Float
 
 
+def relief(sensor: Sensor, deformed: OpticalSurface) -> Array:
+    """Height (mm) and slopes along x and y of the deformed surface at the targets, (3, CELLS, CELLS)."""
+    half = sensor.guide.width_mm / 2
+    middles = _middles(half)
+    height = heights(deformed, middles)
+    slope_y, slope_x = (np.gradient(height, middles, axis=axis) for axis in (0, 1))
+    return np.stack([height, slope_x, slope_y])
+
+
 def direct(sensor: Sensor, basis: AngularBasis, deformed: OpticalSurface) -> Array:
-    """Weighted irradiance of the two families, (n_led, layers, CELLS, CELLS), W/mm².
+    """Weighted irradiance of the two families, (n_led, layers, CELLS, CELLS), W/mm²; see `on`."""
+    return on(sensor, basis, relief(sensor, deformed))
+
+
+def on(sensor: Sensor, basis: AngularBasis, ground: Array, points: int = DISC_POINTS) -> Array:
+    """Weighted irradiance of the two families on a `relief`, (n_led, layers, CELLS, CELLS), W/mm²,
+    from so many points of each disc.
 
     From a disc of flux F and area A in a medium of index m, Lambertian or else with its pattern's factor
     (`lamp.Patterns.relative`), the element dA sends F/(pi A m²) dA
@@ -67,16 +82,14 @@ def direct(sensor: Sensor, basis: AngularBasis, deformed: OpticalSurface) -> Arr
         found = np.zeros((n_led, basis.layers, CELLS, CELLS))
         if here:
             some = replace(sensor, leds=tuple(sensor.leds[number] for number in here))
-            found[here] = direct(some, basis, deformed)
+            found[here] = on(some, basis, ground, points)
         return found
-    half = sensor.guide.width_mm / 2
-    middles = (np.arange(CELLS) + 0.5) / CELLS * 2 * half - half
-    height = heights(deformed, middles)
-    slope_y, slope_x = (np.gradient(height, middles, axis=axis) for axis in (0, 1))
+    middles = _middles(sensor.guide.width_mm / 2)
     x, y = np.meshgrid(middles, middles)
-    target = [_float(values) for values in (x, y, height, slope_x, slope_y)]
+    target = [_float(values) for values in (x, y, *ground)]
 
-    disc = _float(_disc_points())
+    disc = _float(_disc_points(points))
+    end = dr.opaque(mi.UInt32, points)
 
     index = dr.arange(mi.UInt32, n_led * CELLS * CELLS)
     led, point = index // (CELLS * CELLS), index % (CELLS * CELLS)
@@ -85,7 +98,7 @@ def direct(sensor: Sensor, basis: AngularBasis, deformed: OpticalSurface) -> Arr
     weights = basis.weights()
 
     def more(number, straight, mirrored, *total):  # type: ignore[no-untyped-def]
-        return number < DISC_POINTS
+        return number < end
 
     def add(number, straight, mirrored, *total):  # type: ignore[no-untyped-def]
         on_disc = dr.gather(mi.Point2f, disc, number)
@@ -102,13 +115,17 @@ def direct(sensor: Sensor, basis: AngularBasis, deformed: OpticalSurface) -> Arr
     total = list(dr.while_loop(state, more, add))[3:]
     dr.eval(total)
     coarse = np.stack([np.asarray(layer).reshape(n_led, CELLS, CELLS) for layer in total], axis=1)
-    return coarse.astype(np.float64) / DISC_POINTS
+    return coarse.astype(np.float64) / points
 
 
-def _disc_points() -> Array:
-    """Points (DISC_POINTS, 2) of the unit disc, a sunflower of equal areas, each near the one before."""
-    radius = np.sqrt((np.arange(DISC_POINTS) + 0.5) / DISC_POINTS)
-    angle = _GOLDEN_ANGLE * np.arange(DISC_POINTS)
+def _middles(half: float) -> Array:
+    return (np.arange(CELLS) + 0.5) / CELLS * 2 * half - half
+
+
+def _disc_points(count: int = DISC_POINTS) -> Array:
+    """Points (count, 2) of the unit disc, a sunflower of equal areas, each near the one before."""
+    radius = np.sqrt((np.arange(count) + 0.5) / count)
+    angle = _GOLDEN_ANGLE * np.arange(count)
     points = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
     stripe = np.floor((points[:, 0] + 1.0) * 0.5 * _STRIPES)
     back_and_forth = np.where(stripe % 2 == 0, points[:, 1], -points[:, 1])

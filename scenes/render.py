@@ -147,12 +147,12 @@ class Renderer:
         lights: list[Light] = []
         walked: list[Array] = []
         if traced is not None:
-            self._check_leds(shape)
+            self.check_leds(shape)
             pictures, passes, noise = self._again(shape, sight, traced[0], walked), 1, None
         elif quality == "reference":
             pictures = self._followed(sight, -(-samples // passes), seed)
         else:
-            self._check_leds(shape)
+            self.check_leds(shape)
             pictures = self._gathered(shape, sight, max(samples // passes, 2), seed, lights)
         radiance, found = _averaged(pictures, passes, noise, progress or (lambda done: None))
         pressure, displacement_z = surface.at(shape, sight.position_mm)
@@ -169,7 +169,7 @@ class Renderer:
             (np.mean([light.traced for light in lights], axis=0),) if lights else tuple(walked) or None,
         )
 
-    def _check_leds(self, shape: surface.OpticalSurface) -> None:
+    def check_leds(self, shape: surface.OpticalSurface) -> None:
         """Refuse LEDs that the deformed rim would shade: the gathered light knows no shade."""
         lowest = float((shape.rest_mm + shape.displacement_mm[..., 2]).min())
         for number, led in enumerate(self.sensor.leds):

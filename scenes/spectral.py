@@ -58,6 +58,19 @@ class SpectralRenderer:
         alone = self.renderers[0]
         return alone if len(self.renderers) == 1 else Renderer(self.sensor, device=self._device)
 
+    def together(self, each: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+        """Radiance (n_led, rows, columns[, 3]) of all bands, from each band's LEDs, (n, rows, columns)."""
+        camera = self.sensor.camera
+        planes = () if camera.colour == "mono" else (len(camera.channels),)
+        radiance = np.zeros((len(self.sensor.leds), *camera.shape, *planes))
+        for band, leds, layers in zip(self.bands, self._leds, each, strict=True):
+            share = band.share[list(leds)]
+            if planes:
+                radiance[list(leds)] += layers[..., None] * share[:, None, None, :]
+            else:
+                radiance[list(leds)] += layers * share[:, :1, None]
+        return radiance
+
     def render(
         self,
         pressed: pv.PolyData,

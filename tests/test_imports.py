@@ -20,7 +20,18 @@ ALLOWED = {
     | {"pyvista", "scipy", "threadpoolctl", "trimesh"},
     "twin": {"assets", "estimation", "fem", "scenes"}
     | {"dask", "distributed", "drjit", "matplotlib", "mitsuba", "mpl_toolkits", "numpy", "OpenEXR"}
-    | {"pandas", "PIL", "psutil", "pyarrow", "pydantic", "pydantic_core", "pyvista", "rich", "scipy"}
+    | {
+        "optuna",
+        "pandas",
+        "PIL",
+        "psutil",
+        "pyarrow",
+        "pydantic",
+        "pydantic_core",
+        "pyvista",
+        "rich",
+        "scipy",
+    }
     | {"skfem", "threadpoolctl", "torch", "trimesh"},
 }
 MAX_LINES = 400

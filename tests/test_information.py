@@ -371,3 +371,15 @@ def test_the_room_is_light():
         "[getattr(e, n) for n in e.__all__]; assert 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parent.parent)
+
+
+def test_budget_of_what_cannot_be_told_apart() -> None:
+    """A gain and a flux that do the same: without noise they keep their priors, and the wanted is exact."""
+    x = np.linspace(-1, 1, 200)
+    jacobian = np.stack([np.exp(-8 * x**2), 50 + 10 * x, 50 + 10 * x])
+    told = inform(("d", "gain", "flux"), [(jacobian, 50 + 10 * x, CAMERA)], [3.0, 0.01, 0.05])
+    noise = next(cost for cost in error_budget(told, ["d"]).costs if cost.name == "noise")
+    free = bound(told, ["d"], known=["gain"], prior=False).sd[0]  # the sum of both comes from the pictures
+    assert noise.known[0] == pytest.approx(1e-3 * free, rel=1e-3)
+    both = next(cost for cost in error_budget(told, ["flux"]).costs if cost.name == "noise")
+    assert both.known[0] == pytest.approx(1 / np.hypot(1 / 0.01, 1 / 0.05), rel=1e-3)

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from estimation import scalars
-from tests import painted
+from tests import browser, painted
 from twin import cli, mapping, mapping_report, mapping_verdict, thresholds
 from twin.corpus import Corpus
 
@@ -115,6 +115,8 @@ def test_map_writes_its_files_and_says_three_lines(
     assert len(table) == 6 and np.isfinite(table.loc[table["kind"] == "tared", "slope"]).any()
     assert not {p.name for p in (tmp_path / "out").iterdir()} ^ mapping_report.FILES
     assert "<img" in (tmp_path / "out" / "report.html").read_text()
+    if browser.found():  # opens from its file, without network, and has nothing to complain of
+        assert browser.screenshot(tmp_path / "out" / "report.html", tmp_path / "map.png") == []
 
 
 def test_two_corpora_are_compared(corpus: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -48,7 +48,7 @@ def test_the_shipped_studies():
 # Text of the study with a mistake, and what the line must hold: field, value received, what is allowed.
 BAD = {
     "no TOML": ("kind = ", ["not TOML"]),
-    "another kind": (STUDY.replace('"corpus"', '"layout"'), ["kind", "'layout'", "come later"]),
+    "another kind": (STUDY.replace('"corpus"', '"layout"'), ["kind", "'layout'", "twin explore"]),
     "no kind": (STUDY.replace('kind = "corpus"', ""), ["kind", "nothing", "'corpus'"]),
     "unknown key": (STUDY.replace("name =", "colour = 3\nname =", 1), ["colour", "unknown key", "name"]),
     "unknown key of a group": (STUDY.replace("count", "counts"), ["samples.0.counts", "count"]),

@@ -103,7 +103,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
 
 def _parser() -> Parser:
     # which take their readers from here
-    from twin import corpus_arguments, estimate_arguments, study_arguments
+    from twin import corpus_arguments, estimate_arguments, explore_cli, study_arguments
 
     parser = Parser(
         prog="twin",
@@ -183,6 +183,7 @@ def _parser() -> Parser:
     corpus_arguments.add(verbs)
     study_arguments.add(verbs)
     estimate_arguments.add(verbs)
+    explore_cli.add(verbs)
     add_verb(verbs, "schema", "the JSON schema of a design file", _SCHEMA)
     return parser
 

@@ -1,5 +1,5 @@
 """The command line: ``twin demo``, ``simulate``, ``check``, ``export``, ``emulate``, ``corpus``,
-``map``, ``replicate``, ``train``, ``estimate``, ``schema``.
+``map``, ``replicate``, ``train``, ``estimate``, ``explore``, ``schema``.
 
 Exit status 0: done; 1: the machine failed (a full disk); 2: bad input, one line on stderr; 130: interrupted.
 Nothing slow is imported until the input has been checked.
@@ -61,7 +61,7 @@ _FLAGS = {
 
 
 # Verbs that go on, when they are called again, where they were cut off.
-_RESUMED = ("corpus", "emulate", "replicate", "train")
+_RESUMED = ("corpus", "emulate", "explore", "replicate", "train")
 
 # Rooms whose own errors are one line for the user.
 _ROOMS = ("fem.", "scenes.", "estimation.", "twin.")
@@ -135,6 +135,10 @@ def _run(arguments: argparse.Namespace) -> int:
         from twin import estimate_cli
 
         return estimate_cli.run(arguments)
+    elif arguments.verb == "explore":
+        from twin import explore_cli
+
+        return explore_cli.run(arguments)
     else:
         parse(["--help"])
     return 0

@@ -2,8 +2,8 @@
 
 The pictures are those that a sensor's owner has: one per press level, and the reference without inclusion
 beside it. Derivatives are central differences over a step that is far below the prior, with the same light
-seed on both sides. Where only mechanics or the camera change, light that walked through the guide is taken
-from the middle (`Renderer.render(traced=...)`), so that the differences carry no noise of their own.
+seed on both sides. Where only mechanics, roughness or the camera change, light that walked through the guide
+is taken from the middle (`Renderer.render(traced=...)`), so that the differences carry no noise of their own.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ def expected(
     slopes = []
     for number, unknown in enumerate(unknowns):
         value = stage.value(unknown.name)
-        step = _step(unknown, value)
+        step = step_of(unknown, value)
         ends = (value - step, value + step)
         if unknown.relative:
             ends = (value * np.exp(-step), value * np.exp(step))
@@ -156,7 +156,7 @@ def noise_of(design: Design, frames: int = 1) -> Noise:
     )
 
 
-def _step(unknown: Unknown, value: float) -> float:
+def step_of(unknown: Unknown, value: float) -> float:
     """Half the distance of the central difference, in the unknown's own unit."""
     if not unknown.sd > 0:
         raise DesignError(f"unknowns.{unknown.name}.sd", shown(unknown.sd), "a number > 0")
@@ -238,10 +238,11 @@ class _Stage:
         from scenes import SpectralRenderer
 
         sensor = design.sensor()
-        here = replace(
-            sensor, camera=self.design.camera, effective_modulus_kPa=self.design.effective_modulus_kPa
-        )
-        same = here == self.design.sensor()
+        middle = self.design.sensor()
+        # These decide how much of the surface touches, which light meets after it was traced.
+        skin = replace(sensor.skin, rms_slope=middle.skin.rms_slope, kappa=middle.skin.kappa)
+        modulus = middle.effective_modulus_kPa
+        same = replace(sensor, camera=middle.camera, effective_modulus_kPa=modulus, skin=skin) == middle
         if self._kept is None or self._kept[0] != sensor:
             made = SpectralRenderer(sensor, count=design.light.bands, at=design.sensor, device="cpu")
             if self._kept is not None:

@@ -216,7 +216,7 @@ _NOTES = (
 
 
 def _corpus(made: Page, one: One, prefix: str) -> None:
-    made.section(f"{prefix}three lines at {one.level_mm:g} mm, {one.kind}")
+    made.section(f"{prefix}Three lines at {one.level_mm:g} mm, {one.kind}")
     made.figure(
         figures.scatter(one),
         "Each dot is an inclusion, its colour the depth of its top. Line with 95 % prediction band; "
@@ -230,13 +230,13 @@ def _corpus(made: Page, one: One, prefix: str) -> None:
     )
     made.table(*_fits(one.maps))
     made.table(*_adequacy(one.maps))
-    made.section(f"{prefix}press level, tared or raw")
+    made.section(f"{prefix}Press level, tared or raw")
     made.figure(
         figures.levels(one.maps),
         "Solid: tared; dashed: raw. Slopes are relative to the tared ones of the shallowest press (the raw "
         "maximum's is not drawn). Raw area is constant where all of the probe touches, and has no line.",
     )
-    made.section(f"{prefix}threshold k")
+    made.section(f"{prefix}Threshold k")
     made.figure(
         figures.thresholds(one),
         f"Maximum and area taken again from the stored pictures at other thresholds, {one.level_mm:g} mm. "
@@ -279,12 +279,12 @@ def _fits(maps: Sequence[Mapped]) -> tuple[list[str], list[list[str]], str]:
         "norm. slope",
         "norm. intercept",
     ]
-    rows = []
+    rows, left_out = list[list[str]](), dict[str, list[str]]()
     for one in maps:
         row = one.row()
         first = [f"{one.level_mm:g} mm", one.kind, one.pair.name, str(len(one.x)), str(one.unseen)]
         if one.fit is None:
-            rows.append([*first, one.why, *[""] * 7])
+            left_out.setdefault(one.why, []).append(f"{one.level_mm:g} mm {one.kind} {one.pair.name}")
             continue
         rows.append(
             [
@@ -304,6 +304,9 @@ def _fits(maps: Sequence[Mapped]) -> tuple[list[str], list[list[str]], str]:
         "mm³, area 10³ "
         "pixels and mm². LOO: leave-one-out error (rms), % of the span of the picture's scalar."
     )
+    if left_out:
+        told = "; ".join(", ".join(names) + f" ({why})" for why, names in left_out.items())
+        caption += f" No line: {told}."
     return head, rows, caption
 
 

@@ -203,7 +203,7 @@ def _chains(made: Page, found: Replication) -> None:
                 f"{one.k_dn:g}",
                 *(short(v, i) for i, v in enumerate(one.rmse)),
                 *(short(v, i) for i, v in enumerate(one.half_width)),
-                *(f"{100 * v:.0f}" for v in one.explained),
+                *(f"{100 * v:.0f}".replace("-", "−") for v in one.explained),
             ]
         )
     made.table(

@@ -33,7 +33,7 @@ _WIDTH = 10.4  # inches of a figure as wide as the page
 _STYLE = """\
 :root { color-scheme: light; }
 body { font: 16px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, sans-serif; color: #222; background: #fff;
-       max-width: 1040px; margin: 2rem auto; padding: 0 1.2rem; }
+       max-width: 1180px; margin: 2rem auto; padding: 0 1.2rem; }
 h1 { font-size: 1.7rem; line-height: 1.2; margin: 0 0 .2rem; }
 h2 { font-size: 1.25rem; margin: 2.4rem 0 .5rem; border-bottom: 1px solid #ddd; padding-bottom: .2rem; }
 p { max-width: 78ch; margin: .6rem 0; }
@@ -41,17 +41,18 @@ p { max-width: 78ch; margin: .6rem 0; }
 .verdict { background: #f1f5f9; border-left: 4px solid #2b6ca3; padding: .6rem 1rem; margin: 1rem 0; }
 .verdict p { margin: .3rem 0; max-width: none; }
 ul { max-width: 78ch; }
-figure { margin: 1rem 0 1.4rem; }
+figure { margin: 1rem 0 1.4rem; max-width: 1080px; }
 figure img { width: 100%; height: auto; display: block; }
 figcaption, caption { color: #555; font-size: .88rem; text-align: left; max-width: 95ch; }
 caption { padding: .4rem 0; caption-side: top; }
 .wide { overflow-x: auto; }
 table { border-collapse: collapse; font-size: .88rem; margin: .8rem 0 1.2rem;
         font-variant-numeric: tabular-nums; }
-th, td { padding: .22rem .6rem; text-align: right; border-bottom: 1px solid #e5e5e5; white-space: nowrap; }
+th, td { padding: .22rem .45rem; text-align: right; border-bottom: 1px solid #e5e5e5; white-space: nowrap; }
 th { border-bottom: 2px solid #999; vertical-align: bottom; font-weight: 600; }
 th:first-child, td:first-child { text-align: left; padding-left: 0; }
-td.text { white-space: normal; text-align: left; max-width: 46ch; }
+th.text, td.text { text-align: left; }
+td.long { white-space: normal; max-width: 52ch; }
 tr.strong td { font-weight: 600; background: #f1f5f9; }
 nav { font-size: .92rem; margin: 1rem 0; }
 nav a { color: #2b6ca3; margin-right: 1.1rem; text-decoration: none; }
@@ -95,12 +96,16 @@ class Page:
     ) -> Page:
         """Add a table of cells that are shown as they are; rows in `strong` stand out.
 
-        A cell of more than 40 characters is text that may wrap.
+        Columns of words are set to the left; a cell of more than 40 characters may wrap.
         """
-        top = "".join(f"<th>{html.escape(name)}</th>" for name in head)
+        wordy = [_is_wordy([str(row[place]) for row in rows]) for place in range(len(head))]
+        top = "".join(
+            f"<th{' class=text' if words else ''}>{html.escape(name)}</th>"
+            for name, words in zip(head, wordy, strict=True)
+        )
         lines = []
         for number, row in enumerate(rows):
-            cells = "".join(_cell(str(value)) for value in row)
+            cells = "".join(_cell(str(value), words) for value, words in zip(row, wordy, strict=True))
             lines.append(f"<tr{' class=strong' if number in strong else ''}>{cells}</tr>")
         said = f"<caption>{html.escape(caption)}</caption>" if caption else ""
         body = "\n".join(lines)
@@ -117,6 +122,10 @@ class Page:
             f'<figure><img alt="{html.escape(caption, quote=True)}" src="data:image/{kind};base64,{data}">'
             f"<figcaption>{html.escape(caption)}</figcaption></figure>"
         )
+
+    def markup(self, part: str) -> Page:
+        """Add HTML as it is: whoever made it has escaped what it was given, and loads nothing."""
+        return self._put(part)
 
     def html(self) -> str:
         """Return the whole page."""
@@ -217,9 +226,16 @@ def digits(value: float | None, count: int = 3) -> str:
     return text if abs(float(text)) < 10_000 else f"{float(text):,.0f}"
 
 
-def _cell(value: str) -> str:
-    kind = ' class="text"' if len(value) > 40 else ""
-    return f"<td{kind}>{html.escape(value)}</td>"
+def _cell(value: str, words: bool) -> str:
+    kinds = " ".join(filter(None, ["text" if words else "", "long" if len(value) > 40 else ""]))
+    named = f' class="{kinds}"' if kinds else ""
+    return f"<td{named}>{html.escape(value)}</td>"
+
+
+def _is_wordy(cells: Sequence[str]) -> bool:
+    """Whether most of a column's cells begin with a letter; dashes stand for either."""
+    known = [cell for cell in cells if cell not in ("", "—")]
+    return 2 * sum(cell[0].isalpha() for cell in known) > len(known)
 
 
 def _text(value: Any) -> str:

@@ -1,11 +1,12 @@
 """A study of kind "corpus": what is sampled and randomised, as a frozen, checked value from a TOML file.
 
-A study of kind "layout", which compares sensors, comes later. Fields, defaults and an example: CORPORA.md.
+Fields, defaults and an example: CORPORA.md. `twin.layout_study` has the other kind, which compares sensors.
 """
 
 from __future__ import annotations
 
 import json
+import re
 import tomllib
 from dataclasses import dataclass as plain
 from importlib.resources import files
@@ -233,10 +234,12 @@ def check_distribution(where: str, found: Distribution) -> None:
 _ADAPTER = TypeAdapter(Study)
 
 
-def shipped_studies() -> list[str]:
-    """Return the names of the studies that come with the package."""
-    names = (entry.name for entry in files("assets").joinpath("studies").iterdir())
-    return sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml"))
+def shipped_studies(kind: str = "corpus") -> list[str]:
+    """Return the names of the studies of a kind that come with the package."""
+    found = [entry for entry in files("assets").joinpath("studies").iterdir() if entry.name.endswith(".toml")]
+    line = re.compile(rf'^kind\s*=\s*"{kind}"', re.MULTILINE)
+    of_kind = (entry.name for entry in found if line.search(entry.read_text(encoding="utf-8")))
+    return sorted(name.removesuffix(".toml") for name in of_kind)
 
 
 def load_study(name_or_path: str | Path) -> Source:
@@ -249,7 +252,7 @@ def load_study(name_or_path: str | Path) -> Source:
     """
     name = str(name_or_path)
     place = Path(name)
-    if name in shipped_studies():
+    if name in (*shipped_studies(), *shipped_studies("layout")):
         place = Path(str(files("assets").joinpath("studies", f"{name}.toml")))
     names = ", ".join(shipped_studies())
     allowed = f"a shipped study ({names}) or a TOML file that can be read"
@@ -279,7 +282,9 @@ def parse_study(text: str, source: str = "") -> Study:
     except ValueError:  # Python reads no integer of thousands of digits
         raise DesignError("the file", "a number that is too long", "numbers", source=source) from None
     if data.get("kind") == "layout":
-        raise DesignError("kind", "'layout'", "'corpus' (layout studies come later)", source=source)
+        raise DesignError(
+            "kind", "'layout'", "'corpus' (a layout study goes into `twin explore`)", source=source
+        )
     schema = _ADAPTER.json_schema()
     found = list(not_finite(data, schema))
     if found:
