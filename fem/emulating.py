@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fem.emulator import CENTRED, Emulator, Errors, amplitudes, features, lagrange, resample, unfold
+from fem.emulator import CENTRED, Emulator, amplitudes, features, lagrange, resample, unfold
+from fem.emulator_errors import Errors
 from fem.regression import Regression, regress
 from fem.sampling import Plan, contrast, geometry_at
 from fem.solver import one_thread

@@ -14,7 +14,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from fem.emulator import Emulator, Errors
+from fem.emulator import Emulator
+from fem.emulator_errors import Errors
 from fem.regression import Regression, groups
 from fem.sampling import PLAN, Plan, logical_lines
 from fem.solving import KNOTS

@@ -14,7 +14,7 @@ ROOMS = ("assets", "estimation", "fem", "scenes", "twin")
 # What each room may import besides the standard library and itself. Only twin knows the others.
 ALLOWED = {
     "assets": set(),
-    "estimation": {"numpy", "scipy", "torch"},
+    "estimation": {"numpy", "scipy", "torch", "zuko"},
     "fem": {"numpy", "pydantic", "pyvista", "scipy", "skfem", "threadpoolctl"},
     "scenes": {"drjit", "mitsuba", "numpy", "OpenEXR", "PIL", "pydantic"}
     | {"pyvista", "scipy", "threadpoolctl", "trimesh"},
@@ -30,6 +30,7 @@ ALLOWED = {
         "pydantic_core",
         "pyvista",
         "rich",
+        "safetensors",
         "scipy",
     }
     | {"skfem", "threadpoolctl", "torch", "trimesh"},

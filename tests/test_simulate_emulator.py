@@ -11,7 +11,8 @@ from test_simulate import INCLUSION, small
 
 import fem
 import twin
-from fem.emulator import Emulator, Errors
+from fem.emulator import Emulator
+from fem.emulator_errors import Errors
 from fem.regression import Regression
 from fem.sampling import lines, logical_lines
 from fem.solving import KNOTS

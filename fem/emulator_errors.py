@@ -1,0 +1,46 @@
+"""How far an emulator is off."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors of the samples within the ranges, each left out of what was fitted, in per cent of the field's
+    own maximum.
+
+    `pressure` and `displacement` are of the tared fields, the worst of all levels and moduli solved: largest
+    off the probe's edge, root mean square over the area, and largest at all nodes, (n, 3). On the edge itself
+    the pressure is singular: what is found there depends on the mesh, and at finite strain scatters by some
+    per cent. `size_mm` (n,) is the inclusion's. `finer` (p, 3): the same of what a finer mesh adds to the
+    tared pressure. `curve` (rows, 9): number of samples at small and at finite strain, core seconds they
+    took, and of a common set of held-out samples with `size_mm` >= 4 the median and the 95th percentile of
+    each of the pressure's three errors. `solves` (3, 2): of samples, of pairs of a fine and a lean mesh, and
+    of samples at finite strain, how many were tried, and how many of them failed and are missing from all
+    this.
+    """
+
+    size_mm: Floats
+    pressure: Floats
+    displacement: Floats
+    finer: Floats
+    curve: Floats
+    solves: Floats
+
+    @property
+    def failed_percent(self) -> float:
+        """Share of the solves that failed, the worst kind's."""
+        return float(100 * (self.solves[:, 1] / np.maximum(self.solves[:, 0], 1)).max())
+
+    def percentile(self, name: str, percent: float, size_mm: float = 4.0, kind: int = 0) -> float:
+        """Of errors `name` ("pressure" or "displacement") of inclusions with their `size_mm` on this one's
+        side of 4 mm; kind 0: largest off the edge, 1: root mean square, 2: largest."""
+        same = (self.size_mm >= 4.0) == (size_mm >= 4.0)
+        found = getattr(self, name)[same, kind]
+        return float(np.percentile(found, percent)) if len(found) else float("nan")
