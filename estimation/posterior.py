@@ -191,6 +191,7 @@ def train(
     *,
     steps: int = 12_000,
     batch: int = 512,
+    every: int = 250,
     seed: int = 0,
     until: float = math.inf,
     best: dict[str, Tensor] | None = None,
@@ -201,8 +202,8 @@ def train(
 
     Every step's random numbers are children of (seed, step), so that one that was stopped comes out as if it
     had not been. The learning rate falls as half a cosine wave, in time where that is short. One specimen in
-    twenty is kept aside, and tells which state is best; ``best`` is the best before. ``keep`` takes it every
-    250 steps.
+    twenty is kept aside, and tells which state is best; ``best`` is the best before. ``keep`` takes it
+    ``every`` so many steps.
     """
     n = len(simulated.unit)
     aside, rest = np.arange(0, n, 20), np.setdiff1d(np.arange(n), np.arange(0, n, 20))
@@ -220,7 +221,7 @@ def train(
         nn.utils.clip_grad_norm_(network.parameters(), 5.0)
         training.optimiser.step()
         training.step += 1
-        if training.step % 250 == 0 or training.step == steps:
+        if training.step % every == 0 or training.step == steps:
             with torch.no_grad():
                 rng = np.random.default_rng([seed, 2**31])
                 found = float(_loss(network, simulated, np.repeat(aside, 4), rng))

@@ -8,7 +8,7 @@ from estimation.posterior import Simulated, Training, restored, train
 
 SLOPES = np.array([[6.0, 2.0, -1.0, 0.5], [1.0, 4.0, 3.0, -2.0]], np.float32)
 torch.set_num_threads(1)
-TINY = {"width": 32, "depth": 1, "context": 16}
+TINY = {"width": 64, "depth": 2, "context": 16}
 
 
 def linear(n: int = 3000, noise: float = 1.0) -> Simulated:
@@ -24,9 +24,10 @@ def linear(n: int = 3000, noise: float = 1.0) -> Simulated:
 def trained() -> torch.nn.Module:
     told = linear()
     training = Training.begin(told, 0, **TINY)
-    return restored(training.network.size, train(training, told, steps=1000, batch=128))
+    return restored(training.network.size, train(training, told, steps=4000, batch=256))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frames", [1, 16])
 def test_widths_are_those_of_the_closed_form(trained, frames):
     covariance = np.linalg.inv(100.0 * SLOPES @ SLOPES.T * frames)
@@ -40,6 +41,7 @@ def test_widths_are_those_of_the_closed_form(trained, frames):
     assert np.all(np.abs(spread - 1.0) < 0.3)
 
 
+@pytest.mark.slow
 def test_intervals_cover(trained):
     rng = np.random.default_rng(2)
     unit = rng.random((600, 2))
@@ -49,6 +51,7 @@ def test_intervals_cover(trained):
     assert np.all(np.abs(((unit >= low) & (unit <= high)).mean(axis=0) - 0.9) < 0.06)
 
 
+@pytest.mark.slow
 def test_nothing_there_is_told(trained):
     rng = np.random.default_rng(3)
     noise = rng.standard_normal((300, 4)).astype(np.float32)
@@ -60,7 +63,7 @@ def test_nothing_there_is_told(trained):
 def test_stopped_and_gone_on_with_is_as_if_never_stopped():
     told = linear(200)
     whole = Training.begin(told, 4, **TINY)
-    wanted = train(whole, told, steps=500, batch=32)
+    wanted = train(whole, told, steps=40, batch=32, every=20)
     first = Training.begin(told, 4, **TINY)
     kept: list[tuple[dict, dict, dict]] = []
 
@@ -70,11 +73,11 @@ def test_stopped_and_gone_on_with_is_as_if_never_stopped():
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train(first, told, steps=500, batch=32, keep=keep)
+        train(first, told, steps=40, batch=32, every=20, keep=keep)
     state, said, best = kept[0]
     again = Training.begin(told, 4, **TINY)
     again.restore(state, said)
-    found = train(again, told, steps=500, batch=32, best=best)
+    found = train(again, told, steps=40, batch=32, every=20, best=best)
     assert all(torch.equal(wanted[name], found[name]) for name in wanted)
 
 

@@ -36,7 +36,16 @@ from twin.estimator import Estimator, black, save_estimator
 from twin.fields import tables_of
 from twin.fitting import prior_of
 from twin.frame import versions
-from twin.imagined import WANTED, Brightness, inputs_of, noise_variance, pictures, simulate, specimens
+from twin.imagined import (
+    WANTED,
+    Brightness,
+    inputs_of,
+    misaligned_share,
+    noise_variance,
+    pictures,
+    simulate,
+    specimens,
+)
 
 Progress = Callable[[str, float], None]
 Single = NDArray[np.float32]
@@ -289,7 +298,7 @@ def learn_light(design: Design, emulator: fem.Emulator, seen: Seen) -> tuple[Cha
 def features_of(chain: Chain, inputs: Single, values: Sequence[dict[str, float]]) -> Features:
     """Return the features of pictures of these specimens."""
     bright = Brightness.of(chain, values)
-    seen = pictures(chain, inputs, bright)
+    seen = misaligned_share(pictures(chain, inputs, bright), np.random.default_rng(0))
     variance = noise_variance(chain.design, seen, bright.gain).mean(axis=(0, 3, 4))
     reference = variance[:, 1] / REFERENCE_FRAMES
     return compress(seen, np.sqrt(np.stack([variance[:, 0] + reference, reference], axis=1)))
