@@ -1,7 +1,7 @@
 """Traced light of any press of one sensor, learned from the traced light of many presses.
 
-Light that is not gathered has walked far through the guide and carries nearly all of the Monte Carlo noise,
-which is far above the camera's (`tests/test_traced.py`). It changes little and smoothly from press to press:
+Light that is not gathered has walked far through the guide and carries the Monte Carlo noise, which in blocks
+of pixels is above the camera's (`tests/test_traced.py`). It changes little and smoothly from press to press:
 here its maps are a mean plus a few modes, whose amounts are a quadratic of the leading principal components
 of real contact fraction and displacement (reduced-rank regression: Izenman 1975; [izenman1975]). A picture
 that takes it (`Renderer.render(traced=...)`) has no noise of its own and is the same function of the press

@@ -5,11 +5,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from test_forward import pressing
 from test_simulate import small
 
-from scenes import traced
+import fem
+import twin
+from scenes import SpectralRenderer, traced
 from scenes.sensor import NotModelled, Sensor
 from scenes.surface import OpticalSurface
+from twin.exposure import expected_counts
+from twin.retake import average
 
 
 def presses(n: int, seed: int) -> tuple[list[OpticalSurface], list[np.ndarray], list[np.ndarray]]:
@@ -108,3 +113,26 @@ def test_hostile_files_are_refused(learned, tmp_path):
         traced.save([replace(learned, **change)], place)
         with pytest.raises(NotModelled, match="no traced light"):
             traced.load(place)
+
+
+@pytest.mark.slow
+def test_noise_of_tracing_is_above_the_cameras():
+    """Why there is learned light: tared previews of the paper's sensor, in blocks of 12 x 12 pixels."""
+    design = twin.load_design("tsis")
+    (press,) = pressing(design, fem.Inclusion(10, 5, 100), [2.0], None)
+    renderer = SpectralRenderer(design.sensor(), count=design.light.bands, at=design.sensor, device="cpu")
+    tared, counts = [], 0.0
+    for seed in range(4):
+        pair = [
+            expected_counts(
+                design, renderer.render(press.surface, field=field, quality="preview", seed=seed).radiance
+            )
+            for field in ("pressure", "pressure_0")
+        ]
+        tared.append(average((pair[0] - pair[1]).astype(np.float32), (12, 12)))
+        counts = float(pair[0].mean())
+    camera = design.camera
+    photons = np.sqrt(counts * camera.gain_e_per_dn + camera.read_noise_e**2) / camera.gain_e_per_dn / 12.0
+    noise = float(np.std(tared, axis=0, ddof=1).mean())
+    print(f"\ntracing {noise:.3f} counts, camera {photons:.3f}")
+    assert noise > 2.0 * photons
