@@ -1,9 +1,10 @@
-"""Pictures as a smooth function of the contact: linear in its principal components, with some products.
+"""Pictures as a smooth function of the contact: kernel ridge regression on its principal components.
 
 Frustrated reflection lights up where there is contact, and light is linear: a picture is nearly a blurred map
 of the real contact fraction. What is not linear (light that contact elsewhere has taken away, dents that turn
-light) is small and smooth, so a quadratic of the leading components is left for it. Fitted by least squares
-with a penalty; each sample left out in turn (Allen 1974; [allen1974]) tells the error.
+light) is small and smooth. A squared-exponential covariance over many times the spread of the contacts holds
+both (Rasmussen and Williams 2006, section 2.2; [rasmussen2006]); its length and ridge are those with which
+samples that are left out, each with all its presses, are foretold best (section 5.4.2).
 """
 
 from __future__ import annotations
@@ -16,8 +17,12 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Single = NDArray[np.float32]
 
-_SHARE = 4  # samples per term, at least
-_RIDGE = 1e-6  # of the mean square of a term
+_INPUTS = 80  # principal components of the contact
+_MODES = 100  # of the pictures
+_LENGTHS = (2.0, 4.0)  # over the root mean square distance of the contacts from their mean
+_RIDGES = (1e-7, 1e-8, 1e-9, 1e-10, 1e-11)
+MOST = 3600
+"""Pictures that a fit of a few seconds takes."""
 
 
 @dataclass(frozen=True)
@@ -26,89 +31,102 @@ class LightMap:
 
     Attributes
     ----------
-    centre, axes : (d,) and (d, k); inputs of a contact are (contact - centre) @ axes, of unit variance.
-    curved : how many leading inputs go in with squares and products.
-    weights : (terms, pixels)
+    centre, axes : (d,) and (d, k); inputs of a contact are (contact - centre) @ axes.
+    nodes : (n, k) inputs of what was learned from.
+    length : of the covariance.
+    weights : (n, m) of the modes.
+    mean, modes : (pixels,) and (m, pixels).
     shape : of a picture.
     """
 
-    centre: Single
-    axes: Single
-    curved: int
-    weights: Single
+    centre: Floats
+    axes: Floats
+    nodes: Floats
+    length: float
+    weights: Floats
+    mean: Single
+    modes: Single
     shape: tuple[int, ...]
 
-    def inputs(self, contacts: NDArray[np.floating]) -> Single:
+    def inputs(self, contacts: NDArray[np.floating]) -> Floats:
         """Inputs (n, k) of contacts (n, d)."""
-        return np.asarray((np.asarray(contacts, np.float32) - self.centre) @ self.axes)
+        return np.asarray((np.asarray(contacts, np.float64) - self.centre) @ self.axes)
 
-    def at(self, inputs: Single) -> Single:
+    def at(self, inputs: Floats) -> Single:
         """Pictures (n, *shape) of inputs (n, k)."""
-        found = terms(inputs, self.curved) @ self.weights
-        return np.asarray(found.reshape(-1, *self.shape), np.float32)
+        # weights are large and cancel: single precision comes after them
+        amounts = (_covariance(inputs, self.nodes, self.length) @ self.weights).astype(np.float32)
+        return np.asarray((self.mean + amounts @ self.modes).reshape(-1, *self.shape), np.float32)
 
     def __call__(self, contacts: NDArray[np.floating]) -> Single:
         """Pictures (n, *shape) of contacts (n, d)."""
         return self.at(self.inputs(contacts))
 
 
-def terms(inputs: Single, curved: int) -> Single:
-    """One, the inputs, and squares and products of the first `curved` of them, (n, terms)."""
-    products = [
-        inputs[:, i] * inputs[:, j] - np.float32(i == j) for i in range(curved) for j in range(i, curved)
-    ]
-    return np.column_stack([np.ones(len(inputs), np.float32), inputs, *products]).astype(np.float32)
-
-
-def count_terms(k: int, curved: int) -> int:
-    """Number of `terms`."""
-    return 1 + k + curved * (curved + 1) // 2
-
-
 def learn(
     contacts: NDArray[np.floating],
     pictures: NDArray[np.floating],
     groups: NDArray[np.integer] | None = None,
-    *,
-    k: int = 40,
-    curved: int = 10,
 ) -> tuple[LightMap, Single]:
     """Fit pictures (n, ...) of contacts (n, d); return also the errors of those left out, (n, ...).
 
     Parameters
     ----------
     groups : (n,) which belong together, as the press levels of one specimen: they are left out together.
-    k, curved : inputs, and how many of them are curved; fewer are taken where samples are few.
 
     Raises
     ------
     ValueError
         For fewer than 20 pictures.
     """
-    n = len(contacts)
-    if n < 20 or len(pictures) != n:
-        raise ValueError(f"pictures: received {len(pictures)} of {n} contacts; allowed one each, 20 or more")
-    while count_terms(k, curved) * _SHARE > n and k > 4:
-        k, curved = max(k * 4 // 5, 4), min(curved, max(k * 4 // 5, 4)) * 4 // 5
-    x = np.asarray(contacts, np.float64)
+    if len(contacts) < 20 or len(pictures) != len(contacts):
+        received = f"{len(pictures)} of {len(contacts)} contacts"
+        raise ValueError(f"pictures: received {received}; allowed one each, 20 or more")
+    x, shape = np.asarray(contacts, np.float64), np.asarray(pictures).shape
+    y = np.asarray(pictures, np.float32).reshape(len(x), -1)
+    groups = np.arange(len(x)) if groups is None else np.asarray(groups)
     centre = x.mean(axis=0)
     _, size, axes = np.linalg.svd(x - centre, full_matrices=False)
-    axes = axes[:k].T * (np.sqrt(n) / size[:k])
-    a = terms(((x - centre) @ axes).astype(np.float32), curved).astype(np.float64)
-    y = np.asarray(pictures, np.float64).reshape(n, -1)
-    gram = a.T @ a
-    gram[np.diag_indices_from(gram)] += _RIDGE * n
-    inverse = np.linalg.inv(gram)
-    weights = inverse @ (a.T @ y)
-    error = y - a @ weights
-    left = np.empty_like(error)
-    groups = np.arange(n) if groups is None else np.asarray(groups)
+    axes = axes[:_INPUTS].T * np.sqrt(len(x) / (size**2).sum())
+    nodes = (x - centre) @ axes
+    mean = y.mean(axis=0)
+    amounts, modes = _modes(y - mean)
+    best: tuple[float, float, Floats, Floats] | None = None
+    for length in _LENGTHS:
+        kernel = _covariance(nodes, nodes, length)
+        for ridge in _RIDGES:
+            inverse = np.asarray(np.linalg.inv(kernel + ridge * len(x) * np.eye(len(x))))
+            weights = inverse @ amounts
+            left = _left_out(inverse, weights, groups)
+            error = float((left**2).mean())
+            if best is None or error < best[0]:
+                best = (error, length, weights, left)
+    assert best is not None
+    _, length, weights, left = best
+    beyond = (y - mean) - amounts.astype(np.float32) @ modes  # of the modes that are not kept
+    errors = left.astype(np.float32) @ modes + beyond
+    fitted = LightMap(centre, axes, nodes, length, weights, mean, modes, shape[1:])
+    return fitted, errors.reshape(len(x), *shape[1:])
+
+
+def _modes(pictures: Single) -> tuple[Floats, Single]:
+    """Amounts (n, m) and modes (m, pixels) that pictures (n, pixels) are made of, the leading ones."""
+    values, vectors = np.linalg.eigh(np.asarray(pictures @ pictures.T, np.float64))
+    lead = np.argsort(values)[::-1][: min(_MODES, len(pictures) - 1)]
+    lead = lead[values[lead] > 1e-14 * values.max()]
+    amounts = vectors[:, lead] * np.sqrt(values[lead])
+    return amounts, ((vectors[:, lead] / np.sqrt(values[lead])).T.astype(np.float32) @ pictures)
+
+
+def _left_out(inverse: Floats, weights: Floats, groups: NDArray[np.integer]) -> Floats:
+    """Errors (n, m) of each group when it is not learned from."""
+    left = np.empty_like(weights)
     for group in np.unique(groups):
-        rows = groups == group
-        hat = a[rows] @ inverse @ a[rows].T
-        left[rows] = np.linalg.solve(np.eye(rows.sum()) - hat, error[rows])
-    shape = np.asarray(pictures).shape
-    fitted = LightMap(
-        centre.astype(np.float32), axes.astype(np.float32), curved, weights.astype(np.float32), shape[1:]
-    )
-    return fitted, left.reshape(shape).astype(np.float32)
+        rows = np.flatnonzero(groups == group)
+        left[rows] = np.linalg.solve(inverse[np.ix_(rows, rows)], weights[rows])
+    return left
+
+
+def _covariance(a: Floats, b: Floats, length: float) -> Floats:
+    square = (a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1) - 2.0 * a @ b.T
+    return np.asarray(np.exp(-0.5 * np.maximum(square, 0.0) / length**2))

@@ -60,7 +60,9 @@ class Chain:
         camera = self.design.camera
         return camera.dark_current_e_s * camera.exposure_ms * 1e-3 * camera.binning**2
 
-    def inputs(self, many: Sequence[Mapping[str, float]], blank: Sequence[bool] | None = None) -> Single:
+    def inputs(
+        self, many: Sequence[Mapping[str, float]], blank: Sequence[bool] | None = None
+    ) -> NDArray[np.float64]:
         """Return the light map's inputs (n, levels, 2, k); see `contacts`."""
         found = contacts(self.design, self.emulator, many, blank)
         return self.light.inputs(found.reshape(-1, found.shape[-1])).reshape(*found.shape[:3], -1)

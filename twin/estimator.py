@@ -103,7 +103,7 @@ class Estimator:
     def coarse(self, received: Received) -> Single:
         """Return coarse counts above black, (levels, 2, r, c)."""
         both = zip(received.images, received.references, strict=True)
-        found = np.stack([np.stack([average(_cut(one), BLOCK) for one in pair]) for pair in both])
+        found = np.stack([np.stack([average(whole_blocks(one), BLOCK) for one in pair]) for pair in both])
         return np.asarray(found - black(self.chain), np.float32)
 
     def unscaled(self, unit: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -132,7 +132,7 @@ def exposures(received: Received) -> float:
     return float(np.clip(1.0 / variance, 1.0, MOST_FRAMES))
 
 
-def _cut(picture: NDArray[np.floating]) -> Single:
+def whole_blocks(picture: NDArray[np.floating]) -> Single:
     """Leave out rows and columns beyond the last whole block."""
     rows, columns = (side // block * block for side, block in zip(picture.shape, BLOCK, strict=True))
     return np.asarray(picture[:rows, :columns], np.float32)
@@ -159,7 +159,7 @@ def save_estimator(estimator: Estimator, emulator: Path, path: str | Path) -> Pa
         **estimator.card,
         "format": FORMAT,
         "network": estimator.network.size,
-        "light": {"curved": estimator.chain.light.curved, "shape": list(estimator.chain.light.shape)},
+        "light": {"length": estimator.chain.light.length, "shape": list(estimator.chain.light.shape)},
         "features": list(estimator.features.shape),
         "nuisances": list(prior.names),
         "sha256": hashlib.sha256(data).hexdigest(),
@@ -239,8 +239,11 @@ def _assembled(card: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Estimat
     light = LightMap(
         arrays["light.centre"],
         arrays["light.axes"],
-        int(said["curved"]),
+        arrays["light.nodes"],
+        float(said["length"]),
         arrays["light.weights"],
+        arrays["light.mean"],
+        arrays["light.modes"],
         tuple(int(side) for side in said["shape"]),
     )
     pixels = int(np.prod(light.shape))
@@ -256,7 +259,10 @@ def _assembled(card: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Estimat
     )
     fits = (
         light.axes.shape[0] == len(light.centre)
-        and light.weights.shape[1] == pixels
+        and light.nodes.shape == (len(light.weights), light.axes.shape[1])
+        and light.modes.shape == (light.weights.shape[1], pixels)
+        and light.mean.shape == (pixels,)
+        and light.length > 0
         and features.axes.shape == (k, int(np.prod(features.shape)))
         and features.shape[0] == len(design.press.indentation_mm)
         and features.shape[2:] == light.shape[1:]

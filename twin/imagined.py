@@ -25,6 +25,7 @@ from twin.settling import Setting, drawn
 from twin.study import PARAMETERS, parse_study
 
 Single = NDArray[np.float32]
+Floats = NDArray[np.float64]
 
 WANTED = PARAMETERS
 _AT_ONCE = 64  # specimens whose contacts are worked out together
@@ -74,7 +75,7 @@ def inputs_of(
     values: Sequence[dict[str, float]],
     workers: int,
     tell: Callable[[float], None],
-) -> Single:
+) -> Floats:
     """Return the light map's inputs (n, levels, 2, k) of specimens."""
     parts = [values[at : at + _AT_ONCE] for at in range(0, len(values), _AT_ONCE)]
     found = []
@@ -112,7 +113,7 @@ class Brightness:
         )
 
 
-def pictures(chain: Chain, inputs: Single, brightness: Brightness) -> Single:
+def pictures(chain: Chain, inputs: Floats, brightness: Brightness) -> Single:
     """Return expected coarse counts above black, (n, levels, 2, r, c), for inputs (n, levels, 2, k)."""
     found = np.empty((*inputs.shape[:3], *chain.shape), np.float32)
     for rows in _slices(len(inputs), 128):
@@ -151,7 +152,7 @@ def noise_variance(design: Design, counts: NDArray[np.floating], gain: NDArray[n
 def simulate(
     chain: Chain,
     features: Features,
-    inputs: Single,
+    inputs: Floats,
     values: Sequence[dict[str, float]],
     ranges: NDArray[np.floating],
     error: Single,

@@ -32,7 +32,7 @@ from twin.chain import BLOCK, Chain, contacts
 from twin.complaint import DesignError, shown
 from twin.corpus import Corpus
 from twin.design import Design
-from twin.estimator import Estimator, black, save_estimator
+from twin.estimator import Estimator, black, save_estimator, whole_blocks
 from twin.fields import tables_of
 from twin.fitting import prior_of
 from twin.frame import versions
@@ -49,6 +49,7 @@ from twin.imagined import (
 
 Progress = Callable[[str, float], None]
 Single = NDArray[np.float32]
+Floats = NDArray[np.float64]
 
 TEST = "test"
 """Name of the group that nothing is learned from."""
@@ -272,13 +273,21 @@ def _charges(source: Corpus, number: int, level: int) -> Single:
     design = source.design_of(number)
     flux = np.array([led.flux_W for led in design.leds], np.float32)[:, None, None]
     both = (source.layers(number, level), source.reference_layers(number, level))
-    rows, columns = (side // block * block for side, block in zip(source.shape, BLOCK, strict=True))
-    return np.stack([retake.charges(design, layers[:, :rows, :columns], BLOCK) / flux for layers in both])
+    found = []
+    for layers in both:
+        pixels = retake.charges(design, layers, (1, 1))
+        found.append(np.stack([retake.average(whole_blocks(one), BLOCK) for one in pixels]) / flux)
+    return np.stack(found)
 
 
 def learn_light(design: Design, emulator: fem.Emulator, seen: Seen) -> tuple[Chain, Single]:
-    """Return the chain, and its errors of pictures left out, (n, levels, 2, r, c) counts of all LEDs."""
-    n, levels = seen.contacts.shape[:2]
+    """Return the chain, and its errors of pictures left out, (n, levels, 2, r, c) counts of all LEDs.
+
+    No more samples are taken than `light_map.MOST` pictures come from.
+    """
+    levels = seen.contacts.shape[1]
+    seen = seen.of(np.arange(min(len(seen.numbers), light_map.MOST // (2 * levels))))
+    n = len(seen.numbers)
     light, left = light_map.learn(
         seen.contacts.reshape(n * levels * 2, -1),
         seen.charges.reshape(n * levels * 2, *seen.charges.shape[3:]),
@@ -286,16 +295,12 @@ def learn_light(design: Design, emulator: fem.Emulator, seen: Seen) -> tuple[Cha
     )
     chain = Chain(design, emulator, light)
     bright = Brightness.of(chain, seen.values)
-    errors = np.einsum(
-        "nlpiyx,ni->nlpyx",
-        left.reshape(seen.charges.shape),
-        bright.flux_W / bright.gain[:, None],
-        optimize=True,
-    )
+    scale = bright.flux_W / bright.gain[:, None]
+    errors = np.einsum("nlpiyx,ni->nlpyx", left.reshape(seen.charges.shape), scale, optimize=True)
     return chain, np.asarray(errors, np.float32)
 
 
-def features_of(chain: Chain, inputs: Single, values: Sequence[dict[str, float]]) -> Features:
+def features_of(chain: Chain, inputs: Floats, values: Sequence[dict[str, float]]) -> Features:
     """Return the features of pictures of these specimens."""
     bright = Brightness.of(chain, values)
     seen = misaligned_share(pictures(chain, inputs, bright), np.random.default_rng(0))
@@ -305,7 +310,7 @@ def features_of(chain: Chain, inputs: Single, values: Sequence[dict[str, float]]
 
 
 def likeness_of(
-    chain: Chain, inputs: Single, values: Sequence[dict[str, float]], errors: Single, seed: int
+    chain: Chain, inputs: Floats, values: Sequence[dict[str, float]], errors: Single, seed: int
 ) -> dict[str, NDArray[Any]]:
     """Return what `likeness.likeness` needs, of pictures with the light map's errors in them."""
     rng = np.random.default_rng([seed, 3])

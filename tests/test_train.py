@@ -1,0 +1,117 @@
+"""``twin train`` from a corpus to a model that answers, on a small camera with a made-up emulator."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from corpora import freeze_tiny, make_up_emulator
+
+import twin
+from twin import index, sample, store
+from twin.complaint import DesignError
+from twin.estimator import Estimator, load_estimator
+from twin.plan import load_plan
+from twin.received import Received
+from twin.train import train
+
+pytestmark = pytest.mark.slow
+
+MORE = """
+offset_x_mm = [-1, 1]
+offset_y_mm = [-1, 1]
+[[samples]]
+name = "test"
+sampler = "uniform"
+count = 8
+blanks = 0.25
+[samples.inclusion]
+size_mm = [6, 12]
+depth_mm = [4, 6]
+modulus_kPa = [40, 120]
+offset_x_mm = [-1, 1]
+offset_y_mm = [-1, 1]
+[randomise."camera.gain_e_per_dn"]
+distribution = "lognormal"
+sd = 0.02
+"""
+
+
+@pytest.fixture(scope="module")
+def corpus(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("corpus")
+    emulator = make_up_emulator(folder / "made-up.npz")
+    place = freeze_tiny(folder, 36, (1.0, 2.0), emulator=emulator, rows=96, leds=1, more=MORE)
+    plan = load_plan(place)
+    for number in range(len(plan)):
+        sample.make(plan, number, place)
+    index.build(place, plan, store.sha256(place / "plan.json"))
+    return place
+
+
+@pytest.fixture(scope="module")
+def model(corpus, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("models") / "tiny"
+    assert "held-out" in train(corpus, out, minutes=0.3, imagined=400, workers=1)
+    return out.with_suffix(".safetensors")
+
+
+def received(corpus: Path, number: int) -> Received:
+    read = twin.Corpus(corpus)
+    images = np.stack([read.image(number, level) for level in range(2)]).astype(np.float32)
+    references = np.stack([read.reference(number, level) for level in range(2)])
+    return Received(images, references, 1, 16, 8, ("1", "2"))
+
+
+def test_it_answers_and_says_the_same_twice(corpus, model):
+    estimator = load_estimator(model)
+    assert isinstance(estimator, Estimator)
+    first, again = (estimator.estimate(received(corpus, 40), samples=500, seed=3) for _ in range(2))
+    low, high = estimator.prior.ranges[:3].T
+    assert np.all((first.samples >= low) & (first.samples <= high))
+    assert np.array_equal(first.samples, again.samples) and 0.0 <= first.presence <= 1.0
+    assert first.observed.shape == first.predicted.shape == (2, 8, 10)
+
+
+def test_the_card_tells_how_well_it_does(model):
+    card = json.loads(model.with_suffix(".json").read_text(encoding="utf-8"))
+    assert card["samples"]["learned"] == 36 and card["metrics"]["samples"] == 6
+    part = card["metrics"]["1"]["4 mm and more"]
+    assert part["rmse"]["size_mm"] > 0.5 * part["bound"]["size_mm"] > 0.0
+
+
+def test_what_was_done_is_not_done_again(corpus, model):
+    kept = next((model.parent / "tiny.parts").glob("pictures-*.npz"))
+    before = kept.stat().st_mtime_ns
+    said = json.loads(model.with_suffix(".json").read_text(encoding="utf-8"))
+    train(corpus, model.with_suffix(""), minutes=0.3, imagined=400, workers=1)
+    again = json.loads(model.with_suffix(".json").read_text(encoding="utf-8"))
+    assert again["sha256"] == said["sha256"] and kept.stat().st_mtime_ns >= before
+
+
+def test_files_of_a_stranger_are_refused(model, tmp_path):
+    data, card = model.read_bytes(), model.with_suffix(".json").read_text(encoding="utf-8")
+    place = tmp_path / "m.safetensors"
+
+    def refused(arrays: bytes, said: str, match: str) -> None:
+        place.write_bytes(arrays)
+        place.with_suffix(".json").write_text(said, encoding="utf-8")
+        with pytest.raises(DesignError, match=match):
+            load_estimator(place)
+
+    turned = bytearray(data)
+    turned[-1] ^= 1
+    refused(bytes(turned), card, "sha256")
+    refused(data[:1000], card, "sha256")
+    refused(data, "{}", "format is not")
+    refused(data, card.replace('"refuse_below"', '"other"'), "refuse_below")
+    other = json.loads(card)
+    other["features"][0] = 7
+    refused(data, json.dumps(other), "do not fit")
+
+
+def test_a_corpus_that_cannot_teach_is_refused(tmp_path):
+    place = freeze_tiny(tmp_path, 3, (1.0,))
+    index.build(place, load_plan(place), store.sha256(place / "plan.json"))
+    with pytest.raises(DesignError):
+        train(place, tmp_path / "m", minutes=0.1)
