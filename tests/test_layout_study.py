@@ -9,7 +9,7 @@ from twin.complaint import DesignError
 from twin.design import parse_design
 from twin.explored import design_toml
 from twin.layout_study import load, parse
-from twin.study import shipped_studies
+from twin.study_file import shipped_studies
 
 TEXT = """
 kind = "layout"

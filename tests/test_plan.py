@@ -16,7 +16,7 @@ from twin import cli, probe
 from twin.complaint import DesignError
 from twin.design import load_design
 from twin.plan import freeze, load_plan
-from twin.study import shipped_studies
+from twin.study_file import shipped_studies
 
 STUDY = """
 kind = "corpus"

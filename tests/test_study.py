@@ -9,7 +9,8 @@ from twin.complaint import DesignError
 from twin.design import load_design, parse_design
 from twin.fields import expand, put, tables_of
 from twin.plan import freeze
-from twin.study import PARAMETERS, Distribution, load_study, parse_study, shipped_studies
+from twin.study import PARAMETERS, Distribution, load_study, parse_study
+from twin.study_file import shipped_studies
 
 STUDY = """
 kind = "corpus"

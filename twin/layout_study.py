@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import json
 import re
-import tomllib
 from dataclasses import dataclass as plain
-from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -22,7 +20,8 @@ from twin.design import Depth, Offset
 from twin.evaluate import UNKNOWNS, Protocol, check_unknown
 from twin.forward import Unknown
 from twin.objectives import BOUNDS, OBJECTIVES
-from twin.study import CONFIG, MAX_TEXT, FileName, Name, Number, Seed, shipped_studies
+from twin.study import CONFIG, FileName, Name, Number, Seed
+from twin.study_file import read_study, study_tables
 
 MAX_TRIALS = 100_000
 MAX_CHOICES = 1000
@@ -246,34 +245,13 @@ def load(name_or_path: str | Path) -> Source:
         One line: file, dotted field, the value received and what is allowed.
     """
     name = str(name_or_path)
-    own = files("assets").joinpath("studies", f"{name}.toml")
-    place = Path(str(own)) if re.fullmatch(r"[\w-]+", name) and own.is_file() else Path(name)
-    allowed = f"a shipped study ({', '.join(shipped_studies('layout'))}) or a TOML file that can be read"
-    try:
-        if not name or not place.is_file() or place.stat().st_size > MAX_TEXT:
-            raise DesignError("STUDY", shown(name), f"{allowed}, at most {MAX_TEXT} bytes")
-        text = place.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError:
-        raise DesignError("the file", "bytes that are not UTF-8 text", "a TOML file", source=name) from None
-    except DesignError:
-        raise
-    except (OSError, ValueError):
-        raise DesignError("STUDY", shown(name), allowed) from None
-    return Source(parse(text, name), text, place.parent, name)
+    text, folder = read_study(name, "layout")
+    return Source(parse(text, name), text, folder, name)
 
 
 def parse(text: str, source: str = "") -> LayoutStudy:
     """Return the study that a TOML text describes; ``source`` names it in the error."""
-    try:
-        data = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        message, _, place = str(error).rpartition(" (at ")
-        received = f"text that is not TOML ({message})"
-        raise DesignError(place.rstrip(")") or "the file", received, "TOML", source=source) from None
-    except RecursionError:
-        raise DesignError("the file", "tables nested too deep", "a few levels", source=source) from None
-    except ValueError:  # Python reads no integer of thousands of digits
-        raise DesignError("the file", "a number that is too long", "numbers", source=source) from None
+    data = study_tables(text, source)
     if data.get("kind") == "corpus":
         allowed = "'layout' (a corpus study goes into `twin corpus plan`)"
         raise DesignError("kind", "'corpus'", allowed, source=source)

@@ -29,7 +29,6 @@ from twin.sample_table import read_samples
 from twin.study import (
     CONFIG,
     MAX_COUNT,
-    MAX_TEXT,
     CorpusMechanics,
     GroupName,
     LightSeed,
@@ -39,6 +38,7 @@ from twin.study import (
     Seed,
     check_distribution,
 )
+from twin.study_file import MAX_TEXT
 
 PLAN = "plan.json"
 SAMPLES = "samples.parquet"

@@ -6,10 +6,7 @@ Fields, defaults and an example: CORPORA.md. `twin.layout_study` has the other k
 from __future__ import annotations
 
 import json
-import re
-import tomllib
 from dataclasses import dataclass as plain
-from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -20,13 +17,12 @@ from fem.model import Inclusion
 from twin.complaint import DesignError, from_validation, not_finite, shown
 from twin.design import Depth
 from twin.presses import Quality
+from twin.study_file import read_study, study_tables
 
 CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 MAX_COUNT = 10_000_000
 """Most samples of a corpus."""
-MAX_TEXT = 1_000_000
-"""Longest study file, characters."""
 
 PARAMETERS = ("size_mm", "depth_mm", "modulus_kPa", "offset_x_mm", "offset_y_mm")
 """What an inclusion is sampled in."""
@@ -234,14 +230,6 @@ def check_distribution(where: str, found: Distribution) -> None:
 _ADAPTER = TypeAdapter(Study)
 
 
-def shipped_studies(kind: str = "corpus") -> list[str]:
-    """Return the names of the studies of a kind that come with the package."""
-    found = [entry for entry in files("assets").joinpath("studies").iterdir() if entry.name.endswith(".toml")]
-    line = re.compile(rf'^kind\s*=\s*"{kind}"', re.MULTILINE)
-    of_kind = (entry.name for entry in found if line.search(entry.read_text(encoding="utf-8")))
-    return sorted(name.removesuffix(".toml") for name in of_kind)
-
-
 def load_study(name_or_path: str | Path) -> Source:
     """Return the study of that name under ``assets/studies``, or of that TOML file.
 
@@ -251,36 +239,13 @@ def load_study(name_or_path: str | Path) -> Source:
         One line: file, dotted field, the value received and what is allowed.
     """
     name = str(name_or_path)
-    place = Path(name)
-    if name in (*shipped_studies(), *shipped_studies("layout")):
-        place = Path(str(files("assets").joinpath("studies", f"{name}.toml")))
-    names = ", ".join(shipped_studies())
-    allowed = f"a shipped study ({names}) or a TOML file that can be read"
-    try:
-        if not name or not place.is_file() or place.stat().st_size > MAX_TEXT:
-            raise DesignError("STUDY", shown(name), f"{allowed}, at most {MAX_TEXT} bytes")
-        text = place.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError:
-        raise DesignError("the file", "bytes that are not UTF-8 text", "a TOML file", source=name) from None
-    except DesignError:
-        raise
-    except (OSError, ValueError):
-        raise DesignError("STUDY", shown(name), allowed) from None
-    return Source(parse_study(text, name), text, place.parent, name)
+    text, folder = read_study(name, "corpus")
+    return Source(parse_study(text, name), text, folder, name)
 
 
 def parse_study(text: str, source: str = "") -> Study:
     """Return the study that a TOML text describes; ``source`` names it in the error."""
-    try:
-        data = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        message, _, place = str(error).rpartition(" (at ")
-        received = f"text that is not TOML ({message})"
-        raise DesignError(place.rstrip(")") or "the file", received, "TOML", source=source) from None
-    except RecursionError:
-        raise DesignError("the file", "tables nested too deep", "a few levels", source=source) from None
-    except ValueError:  # Python reads no integer of thousands of digits
-        raise DesignError("the file", "a number that is too long", "numbers", source=source) from None
+    data = study_tables(text, source)
     if data.get("kind") == "layout":
         raise DesignError(
             "kind", "'layout'", "'corpus' (a layout study goes into `twin explore`)", source=source
