@@ -26,6 +26,7 @@ Single = NDArray[np.float32]
 
 _EDGE = 1e-3  # of a range, so that its ends are finite on the flow's scale
 _SCALE = 1.8  # standard deviation of the logistic distribution: what a uniform prior is there
+_LARGEST = 1024  # of a network from a file, so that none takes all memory
 MOST_FRAMES = 128
 REFERENCE_FRAMES = 16
 
@@ -252,7 +253,10 @@ def _state(network: nn.Module) -> dict[str, Tensor]:
 
 def restored(size: Mapping[str, Any], state: Mapping[str, Tensor]) -> Posterior:
     """Return the network of this size and state. Raises ValueError if they do not fit."""
-    network = Posterior(**{name: int(value) for name, value in size.items()})
+    sides = {name: int(value) for name, value in size.items()}
+    if not all(1 <= side <= _LARGEST for side in sides.values()):
+        raise ValueError(f"network: received {sides}; allowed 1 to {_LARGEST} each")
+    network = Posterior(**sides)
     try:
         network.load_state_dict(dict(state))
     except RuntimeError as error:

@@ -138,6 +138,14 @@ def whole_blocks(picture: NDArray[np.floating]) -> Single:
     return np.asarray(picture[:rows, :columns], np.float32)
 
 
+def without_luminaires(tables: dict[str, Any]) -> dict[str, Any]:
+    """Design tables without files of luminaires: a model needs none, and a stranger's may name any file."""
+    leds = tables.get("leds")
+    if not isinstance(leds, list):
+        return tables
+    return {**tables, "leds": [{**led, "ies": None} if isinstance(led, dict) else led for led in leds]}
+
+
 def save_estimator(estimator: Estimator, emulator: Path, path: str | Path) -> Path:
     """Write NAME.safetensors and NAME.json; ``path`` is the former's. The card is written last."""
     target = Path(path)
@@ -234,7 +242,7 @@ def _assembled(card: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Estimat
     for name, value in arrays.items():
         if value.dtype.kind == "f" and not np.isfinite(value).all():
             raise ValueError(f"{name} is not finite")
-    design = parse_design(card["design"])
+    design = parse_design(without_luminaires(card["design"]))
     said = card["light"]
     light = LightMap(
         arrays["light.centre"],

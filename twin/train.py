@@ -32,7 +32,7 @@ from twin.chain import BLOCK, Chain, contacts
 from twin.complaint import DesignError, shown
 from twin.corpus import Corpus
 from twin.design import Design
-from twin.estimator import Estimator, black, save_estimator, whole_blocks
+from twin.estimator import Estimator, black, save_estimator, whole_blocks, without_luminaires
 from twin.fields import tables_of
 from twin.fitting import prior_of
 from twin.frame import versions
@@ -156,7 +156,7 @@ def train(
         {
             "name": place.name.removesuffix(".safetensors"),
             "corpus": source.name,
-            "design": tables_of(design),
+            "design": without_luminaires(tables_of(design)),
             "design_sha256": plan.head.design_sha256,
             "shape": list(source.shape),
             "bits": design.camera.bits,
@@ -233,7 +233,7 @@ def gather(source: Corpus, emulator: fem.Emulator, parts: Path, tell: Callable[[
                 int(n): (x, y)
                 for n, x, y in zip(file["numbers"], file["contacts"], file["charges"], strict=True)
             }
-    found = []
+    found, before = [], len(old)
     for count, number in enumerate(source.samples):
         number = int(number)
         if number not in old:
@@ -247,7 +247,8 @@ def gather(source: Corpus, emulator: fem.Emulator, parts: Path, tell: Callable[[
                 _keep(kept, old)
         found.append(old[number])
         tell((count + 1) / len(source.samples))
-    _keep(kept, old)
+    if len(old) > before:
+        _keep(kept, old)
     return Seen(
         np.asarray(source.samples),
         [{k: v for k, v in plan.parameters(int(n)).items() if v is not None} for n in source.samples],
