@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from optuna.storages import RDBStorage
 
 import fem
 from estimation.information import Information
@@ -158,6 +159,50 @@ def test_killed_and_resumed(tmp_path: Path) -> None:
     planned = {tuple(sorted(one.items())) for one in explore.planned(again)}
     tried = [values for values in values_of(after)]
     assert set(tried) == planned  # a layout whose folder was written but not told is tried twice
+
+
+COMMITS = ("_create_new_trial", "_set_trial_param", "set_trial_state_values", "set_trial_user_attr")
+
+
+def killed(found: explore.Exploration, monkeypatch: pytest.MonkeyPatch, commit: int) -> None:
+    """Work until just before a commit to the storage."""
+    commits = 0
+
+    def dies(real: Any) -> Any:
+        def called(*args: Any, **kwargs: Any) -> Any:
+            nonlocal commits
+            commits += 1
+            if commits == commit:
+                raise KeyboardInterrupt
+            return real(*args, **kwargs)
+
+        return called
+
+    with monkeypatch.context() as patch:
+        for name in COMMITS:
+            patch.setattr(RDBStorage, name, dies(getattr(RDBStorage, name)))
+        with pytest.raises(KeyboardInterrupt):
+            explore.work(found, evaluate=evaluated)
+
+
+@pytest.mark.parametrize(
+    ("asking", "recovering"), [(1, None), (2, None), (3, None), (4, None), (5, None), (3, 1), (3, 2), (3, 3)]
+)
+def test_killed_between_any_two_commits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, asking: int, recovering: int | None
+) -> None:
+    """Every planned layout is tried once, wherever in asking and in recovering a process ended."""
+    found = prepared(tmp_path)
+    left = iter([True] * 2)
+    explore.work(found, evaluate=evaluated, go_on=lambda: next(left, False))
+    killed(found, monkeypatch, asking)
+    if recovering is not None:
+        killed(found, monkeypatch, recovering)
+    explore.work(prepared(tmp_path), evaluate=evaluated)
+    assert explore.progress(found).done == 12
+    planned = [tuple(sorted(one.items())) for one in explore.planned(found)]
+    rows = {one["number"]: one for one in records(found.folder)}
+    assert sorted(values_of(rows)) == sorted(planned)
 
 
 def values_of(rows: dict[int, Any]) -> list[Any]:

@@ -7,6 +7,7 @@ what a dead one had under way is found by that and tried again.
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import shutil
@@ -278,16 +279,27 @@ def _next(exploration: Exploration, optuna_study: optuna.Study, me: str) -> optu
 
 
 def _recover(exploration: Exploration, optuna_study: optuna.Study) -> None:
-    """Give up trials of workers that are dead, and put their layouts into the queue again."""
+    """Put the layouts of workers that are dead into the queue again, and give up their trials.
+
+    In this order, and each once: a process may be killed between any two commits. A planned layout is taken
+    from the plan, because its trial may have got only some of its values; a drawn one is drawn again.
+    """
     from optuna.trial import TrialState
 
-    for trial in optuna_study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
-        if not _dead(exploration, trial):
+    trials = optuna_study.get_trials(deepcopy=False)
+    again = {trial.user_attrs.get("again") for trial in trials}
+    for trial in trials:
+        if trial.state != TrialState.RUNNING or not _dead(exploration, trial):
             continue
-        # by its own id: another process may have been quicker
+        number, values = trial.user_attrs.get("planned"), trial.params
+        if number is not None:
+            values = next(itertools.islice(planned(exploration), number, None))
+        if trial.number not in again and len(values) == len(exploration.axes):
+            marks = {"again": trial.number} | ({} if number is None else {"planned": number})
+            optuna_study.enqueue_trial(values, user_attrs=marks)
+        # another machine, which does not see this one's lock, may have been quicker
         with suppress(Exception):
             optuna_study.tell(trial.number, state=TrialState.FAIL)
-            optuna_study.enqueue_trial(trial.params, user_attrs={"again": trial.number})
 
 
 def _dead(exploration: Exploration, trial: optuna.trial.FrozenTrial) -> bool:
