@@ -11,7 +11,7 @@ every time, so that pictures can be compared and differentiated.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -30,6 +30,8 @@ _COARSE = 50  # cells per side on which modes are kept
 _FINE = 100  # on which their mean is
 _BEYOND = 2.0  # how far inputs may leave what was learned, times its reach
 FORMAT = "tsis-traced-1"
+ARRAYS = ("centre", "axes", "reach", "weights", "mean", "modes")
+"""Fields of `TracedLight` that are arrays."""
 
 
 @dataclass(frozen=True)
@@ -194,14 +196,25 @@ def load(path: str | Path) -> tuple[TracedLight, ...]:
 
 
 def _one(file: np.lib.npyio.NpzFile, number: int) -> TracedLight:
-    def part(name: str) -> Array:
-        found = file[f"{number}.{name}"]
-        if found.dtype.kind != "f" or not np.isfinite(found).all():
-            raise ValueError(name)
-        return np.asarray(found, np.float64)
+    arrays = {name: file[f"{number}.{name}"] for name in (*ARRAYS, "error_percent")}
+    return assembled(
+        arrays, str(file[f"{number}.key"]), int(file[f"{number}.presses"]), float(arrays["error_percent"])
+    )
 
-    centre, axes, reach, weights = (part(name) for name in ("centre", "axes", "reach", "weights"))
-    mean, modes = (part(name).astype(np.float32) for name in ("mean", "modes"))
+
+def assembled(
+    arrays: Mapping[str, NDArray[np.generic]], key: str, presses: int, error_percent: float
+) -> TracedLight:
+    """Return learned light from its `ARRAYS` and the rest; raises ValueError where they do not fit."""
+    for name in ARRAYS:
+        if arrays[name].dtype.kind != "f" or not np.isfinite(arrays[name]).all():
+            raise ValueError(name)
+    if arrays["axes"].ndim != 2 or not np.isfinite(error_percent):
+        raise ValueError("axes, error_percent")
+    centre, axes, reach, weights = (
+        np.asarray(arrays[name], np.float64) for name in ("centre", "axes", "reach", "weights")
+    )
+    mean, modes = (np.asarray(arrays[name], np.float32) for name in ("mean", "modes"))
     k, m = axes.shape[1], len(modes)
     fits = (
         axes.shape == (len(centre), _INPUTS)
@@ -214,17 +227,7 @@ def _one(file: np.lib.npyio.NpzFile, number: int) -> TracedLight:
     )
     if not fits:
         raise ValueError("shapes")
-    return TracedLight(
-        str(file[f"{number}.key"]),
-        centre,
-        axes,
-        reach,
-        weights,
-        mean,
-        modes,
-        int(file[f"{number}.presses"]),
-        float(part("error_percent")),
-    )
+    return TracedLight(key, centre, axes, reach, weights, mean, modes, presses, error_percent)
 
 
 def _terms(inputs: Array) -> Array:

@@ -33,7 +33,9 @@ class StandIn:
     mean: tuple[float, float, float] = (10.1, 5.2, 85.0)
     sd: tuple[float, float, float] = (0.2, 0.15, 22.0)
 
-    def estimate(self, received: Received, *, samples: int = 4000, seed: int = 0) -> Estimate:
+    def estimate(
+        self, received: Received, *, samples: int = 4000, seed: int = 0, rendered: bool = True
+    ) -> Estimate:
         """Draw from the posterior, and smooth the pictures."""
         drawn = self._drawn(samples, np.random.default_rng(seed))
         observed = np.stack([coarse(level) for level in received.tared])
@@ -50,6 +52,8 @@ class StandIn:
             observed=observed,
             predicted=predicted,
             noise=np.full(observed.shape, 0.08),
+            method="rendered" if rendered else "network",
+            misfit=1.0,
         )
 
     def _drawn(self, samples: int, rng: np.random.Generator) -> NDArray[np.float64]:

@@ -18,7 +18,7 @@ import fem
 from estimation.light_map import LightMap
 from fem.emulator import fields_of
 from scenes.contact import real_contact
-from twin import presses
+from twin import presses, retake
 from twin.design import Design
 from twin.study import PARAMETERS
 
@@ -92,7 +92,7 @@ def contacts(
     """
     sensors, cases = [], []
     for number, values in enumerate(many):
-        here, depths = _here(design, values), _depths(design, values)
+        here, depths = seen_by(design, values)
         inclusion = None
         if blank is None or not blank[number]:
             size, depth, modulus, x, y = (float(values[name]) for name in PARAMETERS)
@@ -112,9 +112,10 @@ def contacts(
     return found
 
 
-def _here(design: Design, values: Mapping[str, float]) -> Design:
+def seen_by(design: Design, values: Mapping[str, float]) -> tuple[Design, list[float]]:
+    """Return the design with these numbers of its own in it, and its press depths, mm."""
     tissue, skin = design.specimen, design.surface
-    return replace(
+    made = replace(
         design,
         specimen=replace(
             tissue,
@@ -123,8 +124,17 @@ def _here(design: Design, values: Mapping[str, float]) -> Design:
         ),
         surface=replace(skin, rms_slope=float(values.get("surface.rms_slope", skin.rms_slope))),
     )
-
-
-def _depths(design: Design, values: Mapping[str, float]) -> list[float]:
     nominal = enumerate(design.press.indentation_mm)
-    return [float(values.get(f"press.indentation_mm.{level}", depth)) for level, depth in nominal]
+    return made, [float(values.get(f"press.indentation_mm.{level}", depth)) for level, depth in nominal]
+
+
+def coarse_charges(design: Design, layers: NDArray[np.floating]) -> Single:
+    """Return electrons of a block's pixels from each LED, (n_led, r, c), of layers (n_led, rows, columns)."""
+    pixels = retake.charges(design, np.asarray(layers), (1, 1))
+    return np.stack([retake.average(whole_blocks(one), BLOCK) for one in pixels])
+
+
+def whole_blocks(picture: NDArray[np.floating]) -> Single:
+    """Leave out rows and columns beyond the last whole block."""
+    rows, columns = (side // block * block for side, block in zip(picture.shape, BLOCK, strict=True))
+    return np.asarray(picture[:rows, :columns], np.float32)

@@ -131,7 +131,7 @@ def _run(arguments: argparse.Namespace) -> int:
         from twin import study_cli
 
         return study_cli.run(arguments)
-    elif arguments.verb in ("train", "estimate"):
+    elif arguments.verb in ("train", "assess", "estimate"):
         from twin import estimate_cli
 
         return estimate_cli.run(arguments)

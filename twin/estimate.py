@@ -22,6 +22,10 @@ RECORD, PICTURE = "estimate.json", "overview.png"
 
 _UNKNOWN = 0.8
 """Width of a 90 % interval over that of 90 % of the range, above which the pictures tell nothing."""
+_METHODS = {
+    "rendered": "refined by rendering the most probable inclusion",
+    "network": "by the network alone",
+}
 _WORDS = {"size_mm": ("size", "mm"), "depth_mm": ("depth", "mm"), "modulus_kPa": ("modulus", "kPa")}
 
 
@@ -63,6 +67,7 @@ def estimate(
     out: str | Path | None = None,
     samples: int = 4000,
     seed: int = 0,
+    rendered: bool = True,
     progress: Callable[[str, float], None] = lambda stage, done: None,
 ) -> Found:
     """Return what a model knows of the inclusion in a user's pictures.
@@ -73,14 +78,15 @@ def estimate(
     frames, references, exposures, flip : as of `twin.receiving.receive`.
     out : folder to make for `RECORD` and `PICTURE`; None for none.
     samples, seed : of the posterior.
+    rendered : whether the network's answer is refined by rendering, some ten seconds.
 
     Raises `DesignError`, before anything is written, for pictures that cannot be read, do not fit the model,
     or are unlike those that it was trained for.
     """
     if out is None:
-        return _estimate(model, frames, references, exposures, flip, samples, seed, progress)
+        return _estimate(model, frames, references, exposures, flip, samples, seed, rendered, progress)
     with staged(out, holds_estimate) as folder:
-        found = _estimate(model, frames, references, exposures, flip, samples, seed, progress)
+        found = _estimate(model, frames, references, exposures, flip, samples, seed, rendered, progress)
         progress("files", 0.8)
         fill(found, folder)
         interrupt.stop_if_asked()
@@ -95,6 +101,7 @@ def _estimate(
     flip: bool,
     samples: int,
     seed: int,
+    rendered: bool,
     progress: Callable[[str, float], None],
 ) -> Found:
     from twin.estimator import load_estimator
@@ -105,7 +112,7 @@ def _estimate(
     wanted = wanted_of(estimator.card)
     received = receive(frames, wanted, references=references, exposures=exposures, flip=flip)
     progress("estimate", 0.4)
-    answer: Estimate = estimator.estimate(received, samples=samples, seed=seed)
+    answer: Estimate = estimator.estimate(received, samples=samples, seed=seed, rendered=rendered)
     if answer.refused is not None:
         allowed = "pictures like those that the model was trained for"
         raise DesignError(_several(received.names), answer.refused, allowed)
@@ -156,6 +163,8 @@ def record(found: Found) -> dict[str, Any]:
         "inclusion": parameters,
         "covariance": answer.covariance,
         "likeness": answer.likeness,
+        "method": answer.method,
+        "misfit": answer.misfit,
         "pictures": {
             "names": list(received.names),
             "frames": received.frames,
@@ -185,6 +194,7 @@ def told(found: Found) -> str:
         lines.append(line)
     share = 100 * answer.likeness
     lines.append(f"likeness {answer.likeness:.2g}: {share:.2g} % of valid pictures are less like the model's")
+    lines.append(f"{_METHODS[answer.method]}; chi-square over features {answer.misfit:.2f}")
     return "\n".join(lines)
 
 

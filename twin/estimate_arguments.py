@@ -1,4 +1,4 @@
-"""What the verbs of learned estimators accept: ``twin train`` and ``twin estimate``."""
+"""What the verbs of learned estimators accept: ``twin train``, ``assess`` and ``estimate``."""
 
 from __future__ import annotations
 
@@ -17,10 +17,25 @@ examples:
   twin train corpora/train --levels 0 2 --minutes 40 --seed 1 --out models/two-levels
 """
 
+_ASSESS = """\
+Answer every inclusion of a corpus that a model has not seen (its group named test, else all), from one
+exposure and from the mean of 100, by the network and refined by rendering, and compare with the truth and
+with the smallest error that the pictures allow. Writes assessment.json and assessment.png. A corpus of the
+same sensor made by full solves or with other light tells what a mismatch costs. Half a minute a sample and
+core; every answer is kept: the same command goes on, also after Ctrl-C.
+
+examples:
+  twin assess models/tsis corpora/pictures --out assessed
+  twin assess models/tsis corpora/pictures --quick --out quick
+  twin assess models/tsis corpora/solved --samples 20 --out mismatch
+"""
+
 _ESTIMATE = """\
 Tell an inclusion from pictures of a trained model's sensor: size, depth and modulus with 90 % intervals, and
 the probability that there is one. Pictures that the model cannot take, or that are unlike those that it was
-trained for, are refused in one line. With --out: estimate.json, and overview.png to look at.
+trained for, are refused in one line. The network's answer is refined by rendering the most probable
+inclusion, some 20 seconds, where that explains the pictures. With --out: estimate.json, and overview.png to
+look at.
 
 FRAME is a folder of `twin simulate` (one press level or all), or a camera's PNG file of 8 or 16 bits, one for
 each of the model's press levels in order; these need --reference: the same presses without inclusion, in the
@@ -37,7 +52,7 @@ examples:
 
 
 def add(verbs: Any) -> None:
-    """Add both verbs to the parser of `twin.arguments`."""
+    """Add the verbs to the parser of `twin.arguments`."""
     train = add_verb(verbs, "train", "learn to estimate inclusions from the pictures of a corpus", _TRAIN)
     train.add_argument("corpus", metavar="CORPUS", help="folder of a finished corpus")
     train.add_argument("--out", metavar="MODEL", help="model to write, without its ending")
@@ -48,6 +63,17 @@ def add(verbs: Any) -> None:
         "--minutes", type=number(above=0.0), default=20.0, metavar="MIN", help="time to train (default 20)"
     )
     train.add_argument("--seed", type=whole, default=0, metavar="N", help="of all random numbers (default 0)")
+
+    assess = add_verb(verbs, "assess", "how well a model tells inclusions that it has not seen", _ASSESS)
+    assess.add_argument("model", metavar="MODEL", help="what twin train wrote, FILE.safetensors")
+    assess.add_argument("corpus", metavar="CORPUS", help="folder of a finished corpus")
+    assess.add_argument("--out", metavar="DIR", help="folder for the assessment")
+    assess.add_argument("--samples", type=whole, metavar="N", help="at most so many (default: all)")
+    assess.add_argument("--quick", action="store_true", help="the network alone, without rendering")
+    assess.add_argument("--workers", type=whole, metavar="N", help="processes (default: one for each core)")
+    assess.add_argument(
+        "--seed", type=whole, default=0, metavar="N", help="of all random numbers (default 0)"
+    )
 
     estimate = add_verb(verbs, "estimate", "an inclusion from pictures, with how sure that is", _ESTIMATE)
     estimate.add_argument("model", metavar="MODEL", help="what twin train wrote, FILE.safetensors")
@@ -62,6 +88,9 @@ def add(verbs: Any) -> None:
         default=1,
         metavar="N",
         help="FRAMEs of each press level, to be averaged (default 1)",
+    )
+    estimate.add_argument(
+        "--quick", action="store_true", help="the network's answer, without rendering (2 s instead of 20)"
     )
     estimate.add_argument("--flip", action="store_true", help="the files are seen from below, mirrored")
     estimate.add_argument("--out", metavar="DIR", help="new folder for estimate.json and overview.png")

@@ -10,7 +10,7 @@ from twin.complaint import DesignError, shown
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the verb of a parsed command line and return the exit status."""
-    return {"train": _train, "estimate": _estimate}[arguments.verb](arguments)
+    return {"train": _train, "assess": _assess, "estimate": _estimate}[arguments.verb](arguments)
 
 
 def _train(arguments: argparse.Namespace) -> int:
@@ -35,6 +35,30 @@ def _train(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _assess(arguments: argparse.Namespace) -> int:
+    if arguments.out is None:
+        raise DesignError("--out", "nothing", "a folder for the assessment")
+    for flag, value in (("--samples", arguments.samples), ("--workers", arguments.workers)):
+        if value == 0:
+            raise DesignError(flag, "0", "an integer >= 1")
+    from twin import assessing
+    from twin.reporting import Reporter
+
+    with Reporter() as report:
+        record = assessing.assess(
+            arguments.model,
+            arguments.corpus,
+            arguments.out,
+            samples=arguments.samples,
+            rendered=not arguments.quick,
+            workers=arguments.workers,
+            seed=arguments.seed,
+            progress=report,
+        )
+    print(assessing.words(record, arguments.out))
+    return 0
+
+
 def _estimate(arguments: argparse.Namespace) -> int:
     for flag, value, least in (("--frames", arguments.exposures, 1), ("--samples", arguments.samples, 100)):
         if value < least:
@@ -52,6 +76,7 @@ def _estimate(arguments: argparse.Namespace) -> int:
             out=arguments.out,
             samples=arguments.samples,
             seed=arguments.seed,
+            rendered=not arguments.quick,
             progress=report,
         )
     print(estimate.told(found))

@@ -29,6 +29,9 @@ class Estimate:
     observed : (levels, r, c) tared counts of the coarse picture that was seen.
     predicted : (levels, r, c) the same as expected at the posterior mean.
     noise : (levels, r, c) standard deviation of observed minus predicted, counts.
+    method : where the samples come from: "rendered" (`twin.refining`) or "network".
+    misfit : chi-square of the predicted pictures over its number of features; near 1 where the model can make
+        these pictures.
     """
 
     names: tuple[str, ...]
@@ -42,6 +45,8 @@ class Estimate:
     observed: NDArray[np.float64]
     predicted: NDArray[np.float64]
     noise: NDArray[np.float64]
+    method: str
+    misfit: float
 
 
 def probability(value: float) -> str:

@@ -25,17 +25,22 @@ import fem
 from estimation.features import Features
 from estimation.light_map import LightMap
 from estimation.posterior import MOST_FRAMES, REFERENCE_FRAMES, Posterior, restored
+from scenes import traced
+from scenes.sensor import NotModelled
+from scenes.traced import TracedLight
 from twin import likeness
-from twin.chain import BLOCK, Chain
+from twin.chain import BLOCK, Chain, whole_blocks
 from twin.complaint import DesignError, shown
 from twin.design import parse_design
 from twin.estimates import NAMES, Estimate
 from twin.fitting import Fitted, Prior, fit
 from twin.imagined import noise_variance
 from twin.received import Received
+from twin.refining import Off, Refined, refine
+from twin.rendered import rendered as render
 from twin.retake import average
 
-FORMAT = "tsis-estimator-1"
+FORMAT = "tsis-estimator-2"
 _CARD_BYTES = 4 * 2**20
 _NEEDED = {
     "design": dict,
@@ -50,6 +55,7 @@ _NEEDED = {
     "light": dict,
     "features": list,
     "nuisances": list,
+    "traced": list,
     "sha256": str,
 }
 
@@ -69,36 +75,83 @@ class Estimator:
     """(k, k) covariance of the features' errors of the chain."""
     novelty: Mapping[str, NDArray[Any]]
     """What `twin.likeness.learn` gave."""
+    traced: tuple[TracedLight, ...] = ()
+    """Learned light of each band, to render with; none where the corpus was traced press by press."""
 
-    def estimate(self, received: Received, *, samples: int = 4000, seed: int = 0) -> Estimate:
-        """Return what is known after the pictures; ``samples`` of the posterior are drawn from ``seed``."""
+    def estimate(
+        self, received: Received, *, samples: int = 4000, seed: int = 0, rendered: bool = True
+    ) -> Estimate:
+        """Return what is known after the pictures; ``samples`` of the posterior are drawn from ``seed``.
+
+        The network's answer is refined by rendering (`refining.refine`; ten seconds), unless ``rendered`` is
+        False, the pictures are refused or hold no inclusion, or what is rendered does not explain them.
+        """
         seen, frames = self.coarse(received), exposures(received)
-        told = self.features(seen[None])
-        drawn = self.unscaled(self.network.sample(told, frames, samples, seed)[0])
-        fitted = self.fitted(seen, frames, drawn.mean(axis=0))
-        wanted = drawn[:, : len(NAMES)]
         counts = seen + black(self.chain)
         like, strangest = likeness.likeness(self.novelty, counts[:, 0], counts[:, 1])
+        told = self.features(seen[None])
+        presence = float(self.network.present(told, frames)[0])
+        drawn = self.unscaled(self.network.sample(told, frames, samples, seed)[0])
+        reason = None
+        if like < self.card["refuse_below"]:
+            reason = f"pictures unlike this sensor's: {strangest}"
+        refined = None
+        if rendered and self.traced and reason is None and presence >= 0.5:
+            refined = self.refined(told[0], frames, drawn.mean(axis=0), samples=samples, seed=seed)
+        fitted = self.fitted(told[0], frames, drawn.mean(axis=0)) if refined is None else refined.fitted
+        trusted = refined is not None and refined.explains
+        wanted = (refined.samples if refined is not None and trusted else drawn)[:, : len(NAMES)]
         gain = np.array([self.chain.gain(self.prior.values(fitted.x))])
         variance = noise_variance(self.chain.design, seen[None], gain)[0] / np.array(
             [frames, max(frames, REFERENCE_FRAMES)]
         ).reshape(2, 1, 1)
-        reason = None
-        if like < self.card["refuse_below"]:
-            reason = f"pictures unlike this sensor's: {strangest}"
+        expected = fitted.pictures if refined is None else fitted.pictures + refined.off
         return Estimate(
             NAMES,
             wanted,
             wanted.mean(axis=0),
             np.cov(wanted.T),
             np.percentile(wanted, [5.0, 95.0], axis=0).T,
-            float(self.network.present(told, frames)[0]),
+            presence,
             like,
             reason,
             np.asarray(seen[:, 0] - seen[:, 1], np.float64),
-            np.asarray(fitted.pictures[:, 0] - fitted.pictures[:, 1], np.float64),
+            np.asarray(expected[:, 0] - expected[:, 1], np.float64),
             np.sqrt(variance.sum(axis=1, dtype=np.float64)),
+            "rendered" if trusted else "network",
+            fitted.chi_square / len(self.features.spread),
         )
+
+    def refined(
+        self,
+        told: Single,
+        frames: float,
+        start: NDArray[np.floating],
+        *,
+        samples: int = 4000,
+        seed: int = 0,
+        begin: Off | None = None,
+        threads: int | None = None,
+    ) -> Refined | None:
+        """Return the posterior of features (k,) by rendering, from a start (5,); None where the best fit lies
+        beyond what the emulator or the learned light know."""
+        x = np.concatenate([start, np.zeros(self.prior.basis.shape[1])])
+        try:
+            return refine(
+                self.chain,
+                self.features,
+                self.prior,
+                self.error,
+                told,
+                frames,
+                x,
+                lambda values: render(self.chain, self.traced, values, threads=threads),
+                samples=samples,
+                seed=seed,
+                begin=begin,
+            )
+        except (fem.NotModelled, NotModelled):
+            return None
 
     def coarse(self, received: Received) -> Single:
         """Return coarse counts above black, (levels, 2, r, c)."""
@@ -111,12 +164,10 @@ class Estimator:
         low, high = self.prior.ranges.T
         return np.asarray(low + (high - low) * unit)
 
-    def fitted(self, seen: Single, frames: float, start: NDArray[np.floating]) -> Fitted:
-        """Return the most probable specimen by the chain, from a start (5,)."""
-        begin = np.concatenate([start, np.zeros(self.prior.basis.shape[1])])
-        return fit(
-            self.chain, self.features, self.prior, self.features(seen[None])[0], frames, begin, self.error
-        )
+    def fitted(self, told: Single, frames: float, start: NDArray[np.floating]) -> Fitted:
+        """Return the most probable specimen by the chain, for features (k,), from a start (5,)."""
+        x = np.concatenate([start, np.zeros(self.prior.basis.shape[1])])
+        return fit(self.chain, self.features, self.prior, told, frames, x, self.error)
 
 
 def black(chain: Chain) -> float:
@@ -130,12 +181,6 @@ def exposures(received: Received) -> float:
     if received.reference_frames < max(received.frames, REFERENCE_FRAMES):
         variance += 1.0 / received.reference_frames - 1.0 / max(received.frames, REFERENCE_FRAMES)
     return float(np.clip(1.0 / variance, 1.0, MOST_FRAMES))
-
-
-def whole_blocks(picture: NDArray[np.floating]) -> Single:
-    """Leave out rows and columns beyond the last whole block."""
-    rows, columns = (side // block * block for side, block in zip(picture.shape, BLOCK, strict=True))
-    return np.asarray(picture[:rows, :columns], np.float32)
 
 
 def without_luminaires(tables: dict[str, Any]) -> dict[str, Any]:
@@ -160,6 +205,8 @@ def save_estimator(estimator: Estimator, emulator: Path, path: str | Path) -> Pa
     prior = estimator.prior
     arrays |= {"prior.ranges": prior.ranges, "prior.mean": prior.mean, "prior.basis": prior.basis}
     arrays |= {"error": estimator.error}
+    for number, one in enumerate(estimator.traced):
+        arrays |= {f"traced.{number}.{name}": getattr(one, name) for name in traced.ARRAYS}
     arrays |= {f"novelty.{name}": np.asarray(value) for name, value in estimator.novelty.items()}
     arrays |= {f"network.{k}": v.detach().numpy() for k, v in estimator.network.state_dict().items()}
     data = safetensors.numpy.save({name: np.ascontiguousarray(value) for name, value in arrays.items()})
@@ -170,6 +217,10 @@ def save_estimator(estimator: Estimator, emulator: Path, path: str | Path) -> Pa
         "light": {"length": estimator.chain.light.length, "shape": list(estimator.chain.light.shape)},
         "features": list(estimator.features.shape),
         "nuisances": list(prior.names),
+        "traced": [
+            {"key": one.key, "presses": one.presses, "error_percent": one.error_percent}
+            for one in estimator.traced
+        ],
         "sha256": hashlib.sha256(data).hexdigest(),
     }
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -214,6 +265,7 @@ def load_estimator(path: str | Path) -> Estimator:
     except (
         OSError,
         KeyError,
+        IndexError,
         ValueError,
         TypeError,
         OverflowError,
@@ -295,4 +347,14 @@ def _assembled(card: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Estimat
     }
     if not likeness.fits(strange, (features.shape[0], *features.shape[2:])):
         raise ValueError("novelty")
-    return Estimator(card, Chain(design, emulator, light), features, network, prior, arrays["error"], strange)
+    lights = tuple(
+        traced.assembled(
+            {name: arrays[f"traced.{number}.{name}"] for name in traced.ARRAYS},
+            str(said["key"]),
+            int(said["presses"]),
+            float(said["error_percent"]),
+        )
+        for number, said in enumerate(card["traced"])
+    )
+    chain = Chain(design, emulator, light)
+    return Estimator(card, chain, features, network, prior, arrays["error"], strange, lights)

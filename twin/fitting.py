@@ -177,7 +177,7 @@ def fit(
     start : (5 + q,) where to begin.
     error : (k, k) covariance of the chain's own errors.
     """
-    x, precision = _inside(prior, start), prior.precision
+    x, precision = inside(prior, start), prior.precision
     found: Fitted | None = None
     for _ in range(_MOST):
         seen, slopes = jacobian(chain, features, prior, x)
@@ -190,7 +190,7 @@ def fit(
         inverse = np.asarray(np.linalg.inv(information))
         found = Fitted(x, inverse, float(rest @ np.linalg.solve(noise, rest)), seen)
         size = np.abs(step) / np.sqrt(np.diag(inverse))
-        x = _inside(prior, _stepped(chain, features, prior, x, step, observed, noise))
+        x = inside(prior, _stepped(chain, features, prior, x, step, observed, noise))
         if size.max() < _DONE:
             break
     assert found is not None
@@ -208,7 +208,7 @@ def _stepped(
 ) -> Floats:
     """Go the longest of a few halved steps that lowers the sum of squares."""
     shares = (0.0, 1.0, 0.5, 0.2, 0.05)
-    tried = [_inside(prior, x + share * step) for share in shares]
+    tried = [inside(prior, x + share * step) for share in shares]
     rest = observed - features(expected(chain, prior, tried))
     away = np.stack(tried) - prior.middle
     cost = np.einsum("nk,nk->n", rest, np.linalg.solve(noise, rest.T).T)
@@ -216,7 +216,8 @@ def _stepped(
     return tried[int(np.argmin(cost))]
 
 
-def _inside(prior: Prior, x: Floats) -> Floats:
+def inside(prior: Prior, x: Floats) -> Floats:
+    """Return unknowns within the prior's ranges, and within four standard deviations."""
     inner = x.copy()
     inner[:5] = np.clip(x[:5], prior.ranges[:, 0], prior.ranges[:, 1])
     inner[5:] = np.clip(x[5:], -4.0, 4.0)

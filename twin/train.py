@@ -27,12 +27,13 @@ from estimation import light_map
 from estimation.features import Features, compress
 from estimation.posterior import MOST_FRAMES, REFERENCE_FRAMES, Simulated, Training, restored
 from estimation.posterior import train as train_network
-from twin import assess, likeness, retake
-from twin.chain import BLOCK, Chain, contacts
+from scenes import traced
+from twin import assess, likeness
+from twin.chain import BLOCK, Chain, coarse_charges, contacts
 from twin.complaint import DesignError, shown
 from twin.corpus import Corpus
 from twin.design import Design
-from twin.estimator import Estimator, black, save_estimator, whole_blocks, without_luminaires
+from twin.estimator import Estimator, black, save_estimator, without_luminaires
 from twin.fields import tables_of
 from twin.fitting import prior_of
 from twin.frame import versions
@@ -176,6 +177,7 @@ def train(
         prior_of(ranges, many),
         np.asarray(error.T @ error / max(len(error), 1), np.float64),
         likeness_of(chain, inputs[:_LIKE], many[:_LIKE], errors, seed),
+        () if plan.traced is None else traced.load(plan.traced),
     )
     metrics: dict[str, Any] = {}
     if len(testing.numbers):
@@ -184,7 +186,7 @@ def train(
         )
     estimator = replace(estimator, card={**estimator.card, "metrics": metrics})
     save_estimator(estimator, plan.emulator, place)
-    return assess.told(metrics, str(place))
+    return assess.words(metrics, str(place))
 
 
 def _of_levels(source: Corpus, levels: Sequence[int] | None) -> Design:
@@ -241,7 +243,7 @@ def gather(source: Corpus, emulator: fem.Emulator, parts: Path, tell: Callable[[
             blank = plan.inclusion(number) is None
             old[number] = (
                 contacts(base, emulator, [values], [blank])[0],
-                np.stack([_charges(source, number, level) for level in range(source.levels)]),
+                np.stack([charges_of(source, number, level) for level in range(source.levels)]),
             )
             if count % 100 == 99:
                 _keep(kept, old)
@@ -270,14 +272,14 @@ def _keep(place: Path, samples: dict[int, tuple[Single, Single]]) -> None:
     os.replace(part, place)
 
 
-def _charges(source: Corpus, number: int, level: int) -> Single:
+def charges_of(source: Corpus, number: int, level: int) -> Single:
+    """Return coarse light of a picture and its reference, (2, n_led, r, c) electrons per watt of each LED."""
     design = source.design_of(number)
     flux = np.array([led.flux_W for led in design.leds], np.float32)[:, None, None]
     both = (source.layers(number, level), source.reference_layers(number, level))
     found = []
     for layers in both:
-        pixels = retake.charges(design, layers, (1, 1))
-        found.append(np.stack([retake.average(whole_blocks(one), BLOCK) for one in pixels]) / flux)
+        found.append(coarse_charges(design, layers) / flux)
     return np.stack(found)
 
 

@@ -1,0 +1,202 @@
+"""The posterior with the light transport in it: what the network finds, corrected by rendering.
+
+The network and the chain know the light only by a light map, whose errors are as large as the noise of one
+exposure. So the most probable specimen is rendered, what the map is off there is taken out of the pictures,
+and the fit goes on; where it ends, the map's own error no longer matters to first order. What remains unknown
+lies along a narrow, bent valley: a stiffer inclusion that is a little smaller looks nearly the same. It is
+followed from modulus to modulus, all else most probable and normal around it at each (Laplace's method for
+marginals: Tierney and Kadane 1986, [tierney1986]).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg, stats
+from scipy.interpolate import CubicSpline, interp1d
+
+from estimation.features import Features
+from twin.chain import Chain
+from twin.fitting import Fitted, Prior, covariance, fit, inside, jacobian
+
+Floats = NDArray[np.float64]
+Single = NDArray[np.float32]
+
+_RENDERS = 2
+_NEAR = 0.5  # standard deviations that a fit may have moved since it was rendered
+_REMAINS = 0.05  # of the map's error after its correction nearby (see `tests/test_refining.py`)
+_STRANGE = 1e-4  # chance of a misfit, below which the noise does not explain it
+_NODES = 9  # moduli at which all else is fitted
+_REACH = 3.5  # standard deviations that they go away from the most probable
+_STEPS = 2  # of Gauss and Newton at each, from its neighbour
+_FINE = 800  # moduli in between
+_HELD = 2  # the modulus, among `PARAMETERS`
+
+
+Off = NDArray[np.float32]
+"""(levels, 2, r, c) counts by which rendered pictures are above the chain's, near one specimen."""
+
+
+@dataclass(frozen=True)
+class Refined:
+    """A posterior of (size, depth, modulus, offset x, offset y), given that there is an inclusion.
+
+    Attributes
+    ----------
+    samples : (n, 5).
+    fitted : the most probable specimen, by the chain.
+    off : what to add to the chain's pictures nearby.
+    explains : whether the noise explains the rest: if not, these pictures are not what is rendered.
+    renders : how many specimens were rendered.
+    """
+
+    samples: Floats
+    fitted: Fitted
+    off: Off
+    explains: bool
+    renders: int
+
+
+def refine(
+    chain: Chain,
+    features: Features,
+    prior: Prior,
+    error: Floats,
+    observed: NDArray[np.floating],
+    frames: float,
+    start: Floats,
+    render: Callable[[Mapping[str, float]], Single],
+    *,
+    samples: int = 4000,
+    seed: int = 0,
+    begin: Off | None = None,
+) -> Refined:
+    """Return the posterior for features (k,) of pictures that are means of so many exposures.
+
+    Parameters
+    ----------
+    error : (k, k) covariance of the light map's errors in features.
+    start : (5 + q,) where the fit begins.
+    render : expected pictures (levels, 2, r, c) of a specimen's values, by light transport.
+    begin : what is known of the light map's errors near the start, from pictures of the same specimen.
+    """
+    off = np.zeros(features.shape, np.float32) if begin is None else begin
+    found = fit(chain, features, prior, observed - _of(features, off), frames, start, error)
+    remains = _REMAINS**2 * error
+    for renders in range(1, _RENDERS + 1):  # noqa: B007
+        at = found
+        off = render(prior.values(at.x)) - at.pictures
+        found = fit(chain, features, prior, observed - _of(features, off), frames, at.x, remains)
+        moved = np.abs(found.x - at.x) / np.sqrt(np.diag(found.covariance))
+        if moved[:5].max() < _NEAR:
+            break
+    corrected = observed - _of(features, off)
+    drawn = valley(chain, features, prior, corrected, frames, found, remains).draw(prior, samples, seed)
+    explains = bool(stats.chi2.sf(found.chi_square, len(features.spread)) > _STRANGE)
+    return Refined(drawn, found, off, explains, renders)
+
+
+def _of(features: Features, off: Off) -> Floats:
+    """Features (k,) that a difference of pictures adds."""
+    return np.asarray(features(off[None])[0] - features(np.zeros_like(off)[None])[0], np.float64)
+
+
+@dataclass(frozen=True)
+class Valley:
+    """The posterior by modulus.
+
+    Attributes
+    ----------
+    modulus_kPa : (m,) rising.
+    log_density : (m,) of the modulus.
+    middle : (m, 4) most probable size, depth and offsets at each.
+    spread : (m, 4, 4) their covariance at each.
+    """
+
+    modulus_kPa: Floats
+    log_density: Floats
+    middle: Floats
+    spread: Floats
+
+    def draw(self, prior: Prior, count: int, seed: int) -> Floats:
+        """Return samples (count, 5)."""
+        rng = np.random.default_rng([seed, 11])
+        fine = np.linspace(self.modulus_kPa[0], self.modulus_kPa[-1], _FINE)
+        logs = CubicSpline(self.modulus_kPa, self.log_density)(fine)
+        shares = np.cumsum(np.exp(logs - logs.max()))
+        modulus = np.interp(rng.random(count), shares / shares[-1], fine)
+        others = CubicSpline(self.modulus_kPa, self.middle)(modulus)
+        roots = interp1d(self.modulus_kPa, np.linalg.cholesky(self.spread), axis=0)(modulus)
+        others += np.einsum("nij,nj->ni", roots, rng.standard_normal(others.shape))
+        drawn = np.insert(others, _HELD, modulus, axis=1)
+        return np.clip(drawn, prior.ranges[:, 0], prior.ranges[:, 1])
+
+
+def valley(
+    chain: Chain,
+    features: Features,
+    prior: Prior,
+    observed: Floats,
+    frames: float,
+    fitted: Fitted,
+    error: Floats,
+) -> Valley:
+    """Follow the posterior from modulus to modulus, away from the most probable specimen."""
+    sd = float(np.sqrt(fitted.covariance[_HELD, _HELD]))
+    top = float(fitted.x[_HELD])
+    low = max(top - _REACH * sd, prior.ranges[_HELD, 0])
+    high = min(top + _REACH * sd, prior.ranges[_HELD, 1])
+    moduli = np.linspace(low, high, _NODES)
+    first = int(np.argmin(np.abs(moduli - top)))
+    rest = np.delete(np.arange(len(fitted.x)), _HELD)
+    gain = chain.gain(prior.values(fitted.x))
+    noise = linalg.cho_factor(covariance(chain, features, fitted.pictures, gain, frames) + error)
+    slope = fitted.covariance[rest, _HELD] / fitted.covariance[_HELD, _HELD]
+    found: dict[int, tuple[Floats, float, Floats]] = {}
+    begin = fitted.x.copy()
+    begin[rest] += slope * (moduli[first] - top)
+    for way in (range(first, _NODES), range(first - 1, -1, -1)):
+        for node in way:
+            near = [found[n][0] for n in (node - 1, node + 1) if n in found]
+            beyond = [found[n][0] for n in (node - 2, node + 2) if n in found]
+            start = begin if not near else 2.0 * near[0] - beyond[0] if beyond else near[0]
+            start = start.copy()
+            start[_HELD] = moduli[node]
+            found[node] = _held(chain, features, prior, observed, noise, start, rest)
+    nodes = [found[n] for n in range(_NODES)]
+    return Valley(
+        moduli,
+        np.array([one[1] for one in nodes]),
+        np.array([one[0][rest[:4]] for one in nodes]),
+        np.array([one[2][:4, :4] for one in nodes]),
+    )
+
+
+def _held(
+    chain: Chain,
+    features: Features,
+    prior: Prior,
+    observed: Floats,
+    noise: tuple[Floats, bool],
+    start: Floats,
+    rest: NDArray[np.intp],
+) -> tuple[Floats, float, Floats]:
+    """Most probable unknowns with the modulus held, log density there, and covariance of the others."""
+    x = start
+    precision = prior.precision[np.ix_(rest, rest)]
+    for step in range(_STEPS + 1):
+        x = inside(prior, x)
+        seen, slopes = jacobian(chain, features, prior, x)
+        away = observed - features(seen[None])[0]
+        weighted = linalg.cho_solve(noise, slopes[rest].T)
+        inverse = np.linalg.inv(slopes[rest] @ weighted + precision)
+        off = (x - prior.middle)[rest]
+        if step < _STEPS:
+            x = x.copy()
+            x[rest] += inverse @ (weighted.T @ away - precision @ off)
+    cost = away @ linalg.cho_solve(noise, away) + off @ precision @ off
+    # the ranges are flat; their normal stand-in only bounds what the pictures do not tell
+    return x, float(-0.5 * cost + 0.5 * np.linalg.slogdet(inverse)[1]), inverse
