@@ -1,0 +1,134 @@
+"""The posterior by rendering, on a sensor so simple that its posterior can be summed up by brute force."""
+
+from collections.abc import Mapping
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from twin import fitting, refining
+from twin.fitting import Prior
+from twin.study import PARAMETERS
+
+RANGES = np.array([[2.0, 13.0], [4.0, 12.0], [40.0, 120.0], [-2.0, 2.0], [-2.0, 2.0]])
+PRIOR = Prior(RANGES, ("gain",), np.zeros(1), np.full((1, 1), 0.02))
+NOISE = 0.03
+K = 8
+
+
+def truth(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Pictures (..., K): d³ times a contrast that saturates, at widths that tell depth, offsets and a gain."""
+    d, h, e, ox, oy, t = np.moveaxis(np.asarray(x, float), -1, 0)
+    signal = 0.02 * d**3 * (e / 20.0 - 1.0) / (e / 20.0 + 1.5) * (1.0 + 0.02 * t)
+    parts = [signal / h**2 * 10, signal / h**3 * 80, signal * ox / h, signal * oy / h, 0.2 * d + 0.001 * e]
+    return np.stack([*parts, signal * 0.1, 5.0 * (1.0 + 0.02 * t), 0.1 * h], axis=-1)
+
+
+def light_map(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The same, off by more than the noise, and by a little more from place to place."""
+    return truth(x) * 1.01 + 0.1 + 0.002 * np.asarray(x)[..., :1]
+
+
+class Features:
+    """Pictures are features."""
+
+    shape = (K, 1, 1, 1)
+    spread = np.ones(K)
+
+    def __call__(self, pictures: NDArray[Any]) -> NDArray[Any]:
+        return np.asarray(pictures).reshape(-1, K)
+
+
+@pytest.fixture(autouse=True)
+def simple(monkeypatch: pytest.MonkeyPatch) -> None:
+    def expected(chain: Any, prior: Prior, many: Any) -> NDArray[Any]:
+        return light_map(np.array(many)).reshape(-1, *Features.shape)
+
+    def covariance(chain: Any, features: Any, seen: Any, gain: float, frames: float) -> NDArray[Any]:
+        return np.eye(K) * NOISE**2 / frames
+
+    for module in (fitting, refining):
+        monkeypatch.setattr(module, "covariance", covariance)
+    monkeypatch.setattr(fitting, "expected", expected)
+
+
+CHAIN: Any = SimpleNamespace(gain=lambda values: 1.0)
+
+
+def render(values: Mapping[str, float]) -> NDArray[np.float32]:
+    x = np.array([*(values[name] for name in PARAMETERS), values["gain"] / 0.02])
+    return truth(x).reshape(Features.shape).astype(np.float32)
+
+
+def refined(x: NDArray[np.float64], frames: float, seed: int, error: float = 0.15) -> refining.Refined:
+    noise = NOISE / np.sqrt(frames) * np.random.default_rng(seed).standard_normal(K)
+    start = np.array([x[0] + 0.4, x[1] - 0.3, 80.0, 0.0, 0.0, 0.0])
+    features: Any = Features()
+    wide = np.eye(K) * error**2
+    return refining.refine(CHAIN, features, PRIOR, wide, truth(x) + noise, frames, start, render, seed=seed)
+
+
+def brute(x: NDArray[np.float64], noise: NDArray[np.float64]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Mean and standard deviation of size, depth and modulus, from ten million specimens of the prior."""
+    seen, rng = truth(x) + noise, np.random.default_rng(1)
+    near = np.array([0.6, 0.6, np.inf, 0.4, 0.4])
+    low, high = np.maximum(RANGES[:, 0], x[:5] - near), np.minimum(RANGES[:, 1], x[:5] + near)
+    total, mean, square = 0.0, np.zeros(3), np.zeros(3)
+    for _ in range(10):
+        many = np.column_stack([rng.uniform(low, high, (10**6, 5)), rng.standard_normal(10**6)])
+        weight = np.exp(-0.5 * ((truth(many) - seen) ** 2).sum(axis=1) / NOISE**2)
+        total += weight.sum()
+        mean += weight @ many[:, :3]
+        square += weight @ many[:, :3] ** 2
+    mean /= total
+    return mean, np.sqrt(square / total - mean**2)
+
+
+@pytest.mark.parametrize("modulus", [60.0, 95.0])
+def test_valley_is_the_posterior(modulus: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Mean and spread as brute force finds them, where the posterior is bent and cut at its ranges."""
+    x = np.array([7.0, 6.0, modulus, 0.3, -0.2, 0.4])
+    monkeypatch.setattr(refining, "_REMAINS", 0.0)
+    found = refined(x, 1.0, seed=5)
+    noise = NOISE * np.random.default_rng(5).standard_normal(K)
+    mean, sd = brute(x, noise)
+    drawn = found.samples[:, :3]
+    assert np.all(np.abs(drawn.mean(axis=0) - mean) < 0.15 * sd)
+    assert np.all(np.abs(drawn.std(axis=0) / sd - 1.0) < 0.12)
+
+
+def test_the_error_of_the_map_goes() -> None:
+    """Without noise the truth is found, though the map is off by many times the noise of so many frames."""
+    x = np.array([9.0, 6.0, 80.0, 0.3, -0.2, 0.0])
+    start = np.array([9.3, 5.8, 90.0, 0.0, 0.0, 0.0])
+    features: Any = Features()
+    wide = np.eye(K) * 0.15**2
+    plain = fitting.fit(CHAIN, features, PRIOR, truth(x), 1e4, start, wide)
+    found = refining.refine(CHAIN, features, PRIOR, wide, truth(x), 1e4, start, render)
+    off, left = np.abs(plain.x - x)[:3], np.abs(found.fitted.x - x)[:3]
+    assert np.all(left < 0.1 * off)
+    assert found.explains
+
+
+def test_intervals_cover_what_they_say() -> None:
+    """Of 120 inclusions drawn from the prior, 90 % intervals hold the truth 90 % of the time."""
+    rng, inside = np.random.default_rng(2), []
+    for seed in range(120):
+        x = np.array([*rng.uniform(RANGES[:, 0] + [3, 0, 0, 0, 0], RANGES[:, 1]), rng.standard_normal()])
+        drawn = refined(x, 1.0, seed).samples[:, :3]
+        low, high = np.percentile(drawn, [5.0, 95.0], axis=0)
+        inside.append((low <= x[:3]) & (x[:3] <= high))
+    share = np.mean(inside, axis=0)
+    assert np.all(np.abs(share - 0.9) < 3.0 * np.sqrt(0.09 / 120)), share
+
+
+def test_what_cannot_be_rendered_is_not_explained() -> None:
+    features: Any = Features()
+    x = np.array([9.0, 6.0, 80.0, 0.3, -0.2, 0.0])
+    strange = truth(x) * np.where(np.arange(K) % 2, 1.2, 0.8)
+    found = refining.refine(
+        CHAIN, features, PRIOR, np.eye(K) * 1e-4, strange, 1.0, np.array([9.0, 6, 80, 0, 0, 0]), render
+    )
+    assert not found.explains
