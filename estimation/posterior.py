@@ -41,6 +41,7 @@ class Simulated:
     present, absent : (n, k) features without noise, with the inclusion and of the same press without.
     noise, reference_noise : (n, draws, k) features of noise of one exposure of the pictures, and of one of
         the references.
+    stays : (n, draws, k) features of noise that further exposures do not average out.
     error : (m, k) features of errors of the forward model, of which one is added with a random sign.
     """
 
@@ -49,6 +50,7 @@ class Simulated:
     absent: Single
     noise: Single
     reference_noise: Single
+    stays: Single
     error: Single
 
     def batch(
@@ -57,7 +59,9 @@ class Simulated:
         """Noisy features (len(rows), k) of pictures that are means of ``frames`` exposures each."""
         found = (self.absent if empty else self.present)[rows].copy()
         references = np.maximum(frames, REFERENCE_FRAMES)
-        for pool, count in ((self.noise, frames), (self.reference_noise, references)):
+        once = np.ones_like(frames)
+        pools = ((self.noise, frames), (self.reference_noise, references), (self.stays, once))
+        for pool, count in pools:
             draw = rng.integers(pool.shape[1], size=len(rows))
             sign = _signs(rng, len(rows)) / np.sqrt(count, dtype=np.float32)
             found += pool[rows, draw] * sign[:, None].astype(np.float32)

@@ -17,7 +17,7 @@ def linear(n: int = 3000, noise: float = 1.0) -> Simulated:
     features = (10.0 * (unit - 0.5)) @ SLOPES
     draws = noise * rng.standard_normal((n, 4, 4)).astype(np.float32)
     none = np.zeros((n, 1, 4), np.float32)
-    return Simulated(unit, features, np.zeros_like(features), draws, none, np.zeros((0, 4), np.float32))
+    return Simulated(unit, features, np.zeros_like(features), draws, none, none, np.zeros((0, 4), np.float32))
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ K = 8
 
 
 def truth(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Pictures (..., K): d³ times a contrast that saturates, at widths that tell depth, offsets and a gain."""
+    """Pictures (..., K): d³ times a contrast that saturates, in parts that tell depth, offsets and gain."""
     d, h, e, ox, oy, t = np.moveaxis(np.asarray(x, float), -1, 0)
     signal = 0.02 * d**3 * (e / 20.0 - 1.0) / (e / 20.0 + 1.5) * (1.0 + 0.02 * t)
     parts = [signal / h**2 * 10, signal / h**3 * 80, signal * ox / h, signal * oy / h, 0.2 * d + 0.001 * e]

@@ -1,7 +1,7 @@
 """How well an estimator does on samples that it has not seen, beside the bound of its own forward model.
 
-Pictures of one exposure are the stored ones, as the camera took them. Means of many are drawn from the stored
-light: block means with the normal noise that so many exposures leave.
+Pictures of one exposure are the stored ones, as the camera took them; means of many are taken of the stored
+light, rounded exposures each.
 """
 
 from __future__ import annotations
@@ -16,11 +16,10 @@ from scipy import stats
 
 import fem
 from estimation.posterior import REFERENCE_FRAMES
+from twin import retake
 from twin.corpus import Corpus
 from twin.estimates import NAMES
 from twin.estimator import Estimator
-from twin.fitting import bound
-from twin.imagined import Brightness, noise_variance
 from twin.received import Received
 
 if TYPE_CHECKING:
@@ -44,46 +43,49 @@ def assess(
     tell: Callable[[float], None],
 ) -> dict[str, Any]:
     """Return figures of an estimator on held-out samples, by exposures."""
-    rng = np.random.default_rng([seed, 7])
     there = np.flatnonzero(~seen.blank)
     truth = np.array([[seen.values[row][name] for name in NAMES] for row in there])
-    bright = Brightness.of(estimator.chain, seen.values)
-    mean = np.einsum(
-        "nlpiyx,ni->nlpyx", seen.charges, bright.flux_W / bright.gain[:, None], optimize=True
-    ).astype(np.float32)
-    variance = noise_variance(estimator.chain.design, mean, bright.gain)
     found: dict[str, Any] = {"samples": len(there), "blanks": int(seen.blank.sum())}
-    for turn, frames in enumerate(FRAMES):
-        if frames == 1:
-            pictures = np.stack([stored(estimator, source, int(n), levels) for n in seen.numbers])
-        else:
-            count = np.array([frames, max(frames, REFERENCE_FRAMES)]).reshape(2, 1, 1)
-            pictures = mean + np.sqrt(variance / count) * rng.standard_normal(mean.shape, np.float32)
+    for frames in FRAMES[:1]:  # means of many take minutes: `twin assess`
+        pictures = np.stack([stored(estimator, source, int(n), levels) for n in seen.numbers])
         features = estimator.features(pictures)
         unit = estimator.network.sample(features[there], frames, _DRAWS, seed)
         drawn = estimator.unscaled(unit)[..., : len(NAMES)]
-        limits = np.full((len(there), len(NAMES)), np.nan)
+        lowest = np.full((len(there), len(NAMES)), np.nan)
         for place, row in enumerate(there):
             try:
-                least = bound(estimator.chain, estimator.features, estimator.prior, seen.values[row], frames)
-                limits[place] = np.sqrt(np.diag(least)[: len(NAMES)])
+                least, _ = estimator.limits(seen.values[row], frames)
+                lowest[place] = np.sqrt(np.diag(least)[: len(NAMES)])
             except fem.NotModelled:
                 continue
-            tell((turn + 0.6 * place / len(there)) / len(FRAMES))
+            tell(place / len(there))
         presence = estimator.network.present(features, frames)
         found[str(frames)] = {
-            **figures(summed_up(drawn, truth), truth, limits, estimator.prior.ranges),
+            **figures(summed_up(drawn, truth), truth, lowest, estimator.prior.ranges),
             "presence": found_or_not(presence, seen.blank, truth),
         }
     return found
 
 
 def stored(estimator: Estimator, source: Corpus, number: int, levels: Sequence[int]) -> NDArray[np.float32]:
+    """Return a sample's coarse pictures as the camera took them."""
     images = np.stack([source.image(number, level) for level in levels]).astype(np.float32)
     references = np.stack([source.reference(number, level) for level in levels])
     frames = source.design.camera.frames
-    received = Received(images, references, frames, max(frames, 16), estimator.card["bits"], ())
+    received = Received(images, references, frames, max(frames, REFERENCE_FRAMES), estimator.card["bits"], ())
     return estimator.coarse(received)
+
+
+def averaged(
+    estimator: Estimator, source: Corpus, number: int, levels: Sequence[int], frames: int, seed: int
+) -> NDArray[np.float32]:
+    """Return a sample's coarse pictures as means of so many exposures, taken anew."""
+    design, rng = source.design_of(number), np.random.default_rng([seed, number, frames])
+    count = max(frames, REFERENCE_FRAMES)
+    images = [retake.mean_of(design, source.layers(number, level), frames, rng) for level in levels]
+    plain = [retake.mean_of(design, source.reference_layers(number, level), count, rng) for level in levels]
+    bits = estimator.card["bits"]
+    return estimator.coarse(Received(np.stack(images), np.stack(plain), frames, count, bits, ()))
 
 
 @dataclass(frozen=True)

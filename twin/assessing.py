@@ -21,19 +21,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 import fem
-from estimation.posterior import REFERENCE_FRAMES
-from twin.assess import FRAMES, Answers, figures, found_or_not, stored, summed_up
+from estimation.detection import ideal_auc
+from twin.assess import FRAMES, Answers, averaged, figures, found_or_not, stored, summed_up
 from twin.complaint import DesignError, shown
 from twin.corpus import Corpus
 from twin.estimates import NAMES
 from twin.estimator import Estimator, load_estimator
-from twin.fitting import bound
-from twin.imagined import noise_variance
 from twin.report import write_json
-from twin.train import TEST, charges_of
+from twin.train import TEST, level_names
 
 SAMPLES, RECORD, PICTURE = "samples", "assessment.json", "assessment.png"
 METHODS = ("network", "rendered")
+_ALL = 1e3
+SIZES = ((2.0, 3.0), (3.0, 4.0), (4.0, 8.0), (8.0, np.inf))
+DEPTHS = ((0.0, 8.0), (8.0, np.inf))
+"""Sizes and depths, mm, by which presence is told."""
 _DRAWS = 4000
 _NUMBERS = ("mean", "sd", "low", "high", "rank")
 
@@ -90,7 +92,7 @@ def assess(
         In one line.
     """
     source, estimator = Corpus(corpus), load_estimator(model)
-    _check(source, estimator)
+    _levels(source, estimator)
     numbers = [int(n) for n in source.samples if source.plan.group(int(n)) == TEST]
     numbers = (numbers or [int(n) for n in source.samples])[:samples]
     folder = Path(out)
@@ -127,14 +129,20 @@ def assess(
     return record
 
 
-def _check(source: Corpus, estimator: Estimator) -> None:
+def _levels(source: Corpus, estimator: Estimator) -> list[int]:
+    """Numbers of the corpus's press levels that the model wants; raises `DesignError` for other sensors."""
     design, card = source.design, estimator.card
-    given = (list(source.shape), list(source.plan.indentation_mm), len(design.leds))
-    wanted = (card["shape"], card["indentation_mm"], len(estimator.chain.design.leds))
-    if given != wanted:
-        names = ("pixels", "indentation_mm", "LEDs")
-        name, one, other = next(part for part in zip(names, given, wanted, strict=True) if part[1] != part[2])
-        raise DesignError(name, shown(one), f"{other}, as the model was trained for", source=source.name)
+    names = ("pixels", "LEDs")
+    given = (list(source.shape), len(design.leds))
+    wanted = (card["shape"], len(estimator.chain.design.leds))
+    for name, one, other in zip(names, given, wanted, strict=True):
+        if one != other:
+            raise DesignError(name, shown(one), f"{other}, as the model was trained for", source=source.name)
+    there, depths = list(source.plan.indentation_mm), card["indentation_mm"]
+    if not set(depths) <= set(there):
+        allowed = f"levels {depths}, as the model was trained for"
+        raise DesignError("indentation_mm", shown(there), allowed, source=source.name)
+    return [there.index(depth) for depth in depths]
 
 
 def _claim(folder: Path, told: Mapping[str, Any]) -> None:
@@ -171,13 +179,10 @@ def _opened(corpus: str) -> Corpus:
 def answer(task: Task) -> None:
     """Answer one sample and write its record; runs in a worker process."""
     estimator, source = _loaded(task.model), _opened(task.corpus)
-    plan, chain = source.plan, estimator.chain
-    values = {k: v for k, v in plan.parameters(task.sample).items() if v is not None}
+    plan = source.plan
+    levels = _levels(source, estimator)
+    values = level_names({k: v for k, v in plan.parameters(task.sample).items() if v is not None}, levels)
     blank = plan.inclusion(task.sample) is None
-    levels = range(source.levels)
-    light = np.stack([charges_of(source, task.sample, level) for level in levels])
-    mean = np.einsum("lpiyx,i->lpyx", light, chain.fluxes(values) / chain.gain(values)).astype(np.float32)
-    variance = noise_variance(chain.design, mean[None], np.array([chain.gain(values)]))[0]
     row: dict[str, Any] = {
         "sample": task.sample,
         "blank": blank,
@@ -189,9 +194,7 @@ def answer(task: Task) -> None:
         if frames == 1:
             seen = stored(estimator, source, task.sample, levels)
         else:
-            rng = np.random.default_rng([task.seed, task.sample, frames])
-            count = np.array([frames, max(frames, REFERENCE_FRAMES)]).reshape(2, 1, 1)
-            seen = mean + np.sqrt(variance / count) * rng.standard_normal(mean.shape, np.float32)
+            seen = averaged(estimator, source, task.sample, levels, frames, task.seed)
         told = estimator.features(seen[None])
         found: dict[str, Any] = {"presence": float(estimator.network.present(told, frames)[0])}
         row[str(frames)] = found
@@ -201,10 +204,10 @@ def answer(task: Task) -> None:
         drawn = estimator.unscaled(estimator.network.sample(told, frames, _DRAWS, task.seed)[0])
         found["network"] = found["rendered"] = _short(drawn, truth)
         try:
-            least = bound(chain, estimator.features, estimator.prior, values, frames)
+            least, found["deflection"] = estimator.limits(values, frames)
             found["bound"] = np.sqrt(np.diag(least)[: len(NAMES)]).tolist()
         except fem.NotModelled:
-            found["bound"] = None
+            found["bound"] = found["deflection"] = None
         if task.rendered and estimator.traced:
             refined = estimator.refined(
                 told[0], frames, drawn.mean(axis=0), samples=_DRAWS, seed=task.seed, begin=off, threads=1
@@ -250,11 +253,44 @@ def _record(rows: list[dict[str, Any]], estimator: Estimator, rendered: bool) ->
         presence = np.array([row[str(frames)]["presence"] for row in rows])
         truth = np.array([row["truth"] for row in rows if not row["blank"]]).reshape(-1, 3)
         part["presence"] = found_or_not(presence, blank, truth)
+        ideal = np.array([row[str(frames)]["deflection"] or np.nan for row in rows if not row["blank"]])
+        if part["presence"]:
+            part["presence"]["beside_ideal"] = _beside_ideal(presence, blank, truth, ideal)
         if rendered:
             tried = [row[str(frames)] for row in rows if not row["blank"]]
             part["explained_by_rendering"] = float(np.mean([one.get("explains", False) for one in tried]))
             part["renders"] = float(np.mean([one.get("renders", 0) for one in tried]))
         found[str(frames)] = part
+    return found
+
+
+def _beside_ideal(
+    presence: NDArray[np.float64],
+    blank: NDArray[np.bool_],
+    truth: NDArray[np.float64],
+    deflection: NDArray[np.float64],
+) -> list[dict[str, Any]]:
+    """Areas under the curve of the network and of an ideal observer, by size and depth."""
+    empty, full = presence[blank], presence[~blank]
+    if not len(empty):
+        return []
+    area = (full[:, None] > empty).mean(axis=1) + 0.5 * (full[:, None] == empty).mean(axis=1)
+    ideal = ideal_auc(deflection)
+    found = []
+    for low, high in SIZES:
+        for shallow, deep in DEPTHS:
+            size, depth = truth[:, 0], truth[:, 1]
+            rows = (size >= low) & (size < high) & (depth >= shallow) & (depth < deep)
+            if rows.any():
+                found.append(
+                    {
+                        "size_mm": [low, high],
+                        "depth_mm": [shallow, deep],
+                        "inclusions": int(rows.sum()),
+                        "area": float(area[rows].mean()),
+                        "ideal": float(np.nanmean(ideal[rows])),
+                    }
+                )
     return found
 
 
@@ -281,9 +317,21 @@ def words(record: Mapping[str, Any], out: str) -> str:
                 ranks = ", ".join(f"{value:.2g}" for value in one["rank_p"].values())
                 lines.append(f"      90 % intervals cover {covered}; ranks p {ranks}")
         presence = record[str(frames)]["presence"]
-        if presence:
-            lines.append(f"      inclusion or none: area under the curve {presence['area']:.4f}")
+        if presence.get("beside_ideal"):
+            lines.append(
+                f"      inclusion or none: area under the curve {presence['area']:.4f}; by size and depth:"
+            )
+            for cell in presence["beside_ideal"]:
+                size, depth = (_span(*cell[name]) for name in ("size_mm", "depth_mm"))
+                lines.append(
+                    f"        {cell['inclusions']:>3} of {size}, {depth} deep: {cell['area']:.3f}, "
+                    f"ideal observer {cell['ideal']:.3f}"
+                )
     return "\n".join([*lines, f"look at: {Path(out) / PICTURE}"])
+
+
+def _span(low: float, high: float) -> str:
+    return f"{low:g} mm and more" if high > _ALL else f"{low:g} to {high:g} mm"
 
 
 def _one_thread() -> None:

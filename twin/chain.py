@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 import fem
 from estimation.light_map import LightMap
 from fem.emulator import fields_of
+from scenes.camera import fixed_pattern
 from scenes.contact import real_contact
 from twin import presses, retake
 from twin.design import Design
@@ -59,6 +60,12 @@ class Chain:
         """Counts without light at a gain of 1 electron per count: the dark charge, electrons."""
         camera = self.design.camera
         return camera.dark_current_e_s * camera.exposure_ms * 1e-3 * camera.binning**2
+
+    @cached_property
+    def pattern_dn(self) -> Single:
+        """Dark offsets of the camera's pixels, (r, c) counts, as a dark frame tells them."""
+        _, offset = fixed_pattern(self.design.camera)
+        return retake.average(whole_blocks(offset), BLOCK) / np.float32(self.design.camera.gain_e_per_dn)
 
     def inputs(
         self, many: Sequence[Mapping[str, float]], blank: Sequence[bool] | None = None

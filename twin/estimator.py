@@ -33,8 +33,8 @@ from twin.chain import BLOCK, Chain, whole_blocks
 from twin.complaint import DesignError, shown
 from twin.design import parse_design
 from twin.estimates import NAMES, Estimate
-from twin.fitting import Fitted, Prior, fit
-from twin.imagined import noise_variance
+from twin.fitting import Fitted, Prior, fit, limits
+from twin.imagined import mean_variance
 from twin.received import Received
 from twin.refining import Off, Refined, refine
 from twin.rendered import rendered as render
@@ -102,9 +102,7 @@ class Estimator:
         trusted = refined is not None and refined.explains
         wanted = (refined.samples if refined is not None and trusted else drawn)[:, : len(NAMES)]
         gain = np.array([self.chain.gain(self.prior.values(fitted.x))])
-        variance = noise_variance(self.chain.design, seen[None], gain)[0] / np.array(
-            [frames, max(frames, REFERENCE_FRAMES)]
-        ).reshape(2, 1, 1)
+        variance = mean_variance(self.chain.design, seen[None], gain, frames)[0]
         expected = fitted.pictures if refined is None else fitted.pictures + refined.off
         return Estimate(
             NAMES,
@@ -157,12 +155,16 @@ class Estimator:
         """Return coarse counts above black, (levels, 2, r, c)."""
         both = zip(received.images, received.references, strict=True)
         found = np.stack([np.stack([average(whole_blocks(one), BLOCK) for one in pair]) for pair in both])
-        return np.asarray(found - black(self.chain), np.float32)
+        return np.asarray(found - black(self.chain) - self.chain.pattern_dn, np.float32)
 
     def unscaled(self, unit: NDArray[np.floating]) -> NDArray[np.float64]:
         """Parameters (..., 5) from 0 to 1."""
         low, high = self.prior.ranges.T
         return np.asarray(low + (high - low) * unit)
+
+    def limits(self, values: Mapping[str, float], frames: float) -> tuple[NDArray[np.float64], float]:
+        """Return the bound and the deflection at true values; see `fitting.limits`."""
+        return limits(self.chain, self.features, self.prior, values, frames)
 
     def fitted(self, told: Single, frames: float, start: NDArray[np.floating]) -> Fitted:
         """Return the most probable specimen by the chain, for features (k,), from a start (5,)."""

@@ -16,12 +16,11 @@ from numpy.typing import NDArray
 from estimation.features import Features
 from fem.sampling import clearance
 from twin.chain import Chain
-from twin.imagined import Brightness, noise_variance, pictures
+from twin.imagined import Brightness, mean_variance, pictures
 from twin.study import PARAMETERS
 
 Floats = NDArray[np.float64]
 
-REFERENCE_FRAMES = 16
 _STEPS = {"size_mm": 0.02, "depth_mm": 0.02, "modulus_kPa": 0.5, "offset_x_mm": 0.02, "offset_y_mm": 0.02}
 _NUISANCE_STEP = 0.1  # standard deviations
 _MOST = 12  # Gauss-Newton steps
@@ -149,15 +148,15 @@ def covariance(
 ) -> Floats:
     """Return the covariance (k, k) of the features' noise in pictures (levels, 2, r, c) of so many exposures.
 
-    References are the mean of `REFERENCE_FRAMES` at least.
+    References are the mean of `imagined.REFERENCE_FRAMES` at least.
     """
-    variance = noise_variance(chain.design, seen[None], np.array([gain]))[0].reshape(*seen.shape[:2], -1)
+    variance = mean_variance(chain.design, seen[None], np.array([gain]), frames)[0]
     total = np.zeros((len(features.spread),) * 2)
     onto = features.onto
-    for place, count in ((0, frames), (1, max(frames, REFERENCE_FRAMES))):
+    for place in (0, 1):
         for level in range(len(seen)):
             axes = onto[level, place]
-            total += (axes * (variance[level, place] / count)[:, None]).T @ axes
+            total += (axes * variance[level, place].reshape(-1, 1)).T @ axes
     return total
 
 
@@ -224,14 +223,20 @@ def inside(prior: Prior, x: Floats) -> Floats:
     return inner
 
 
-def bound(
+def limits(
     chain: Chain, features: Features, prior: Prior, values: Mapping[str, float], frames: float
-) -> Floats:
-    """Return the prior-included bound (5 + q, 5 + q) at true values: (J C⁻¹ Jᵀ + P)⁻¹.
+) -> tuple[Floats, float]:
+    """Return the prior-included bound (5 + q, 5 + q) at true values, (J C⁻¹ Jᵀ + P)⁻¹, and the deflection d'
+    with which an ideal observer tells the inclusion from none (see `estimation.detection`).
 
     Raises `fem.NotModelled` where the chain cannot go.
     """
     x = prior.unknowns(values)
     seen, slopes = jacobian(chain, features, prior, x)
     noise = covariance(chain, features, seen, chain.gain(prior.values(x)), frames)
-    return np.asarray(np.linalg.inv(slopes @ np.linalg.solve(noise, slopes.T) + prior.precision))
+    told = slopes @ np.linalg.solve(noise, slopes.T)
+    without = np.stack([seen[:, 1], seen[:, 1]], axis=1)
+    signal = (features(seen[None])[0] - features(without[None])[0]).astype(np.float64)
+    nuisance = slopes[5:]
+    least = signal @ np.linalg.solve(noise + nuisance.T @ nuisance, signal)
+    return np.asarray(np.linalg.inv(told + prior.precision)), float(np.sqrt(max(least, 0.0)))

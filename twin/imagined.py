@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 import fem
 from estimation.features import Features
 from estimation.novelty import misaligned
-from estimation.posterior import Simulated
+from estimation.posterior import REFERENCE_FRAMES, Simulated
 from twin.chain import BLOCK, FIELDS, Chain, contacts
 from twin.complaint import DesignError, shown
 from twin.design import Design
@@ -29,6 +29,7 @@ Floats = NDArray[np.float64]
 
 WANTED = PARAMETERS
 _AT_ONCE = 64  # specimens whose contacts are worked out together
+_HARMONICS = 6  # of rounding
 _DRAWS = 4  # of noise for every specimen
 MISALIGNED_PERCENT = 1.0
 
@@ -136,17 +137,43 @@ def misaligned_share(seen: Single, rng: np.random.Generator) -> Single:
     return found
 
 
-def noise_variance(design: Design, counts: NDArray[np.floating], gain: NDArray[np.floating]) -> Single:
-    """Return the variance of one exposure of a block of pixels, counts², for counts above black.
+def noise_variance(
+    design: Design, counts: NDArray[np.floating], gain: NDArray[np.floating]
+) -> tuple[Single, Single]:
+    """Return what a block of pixels is off by, counts², for counts above black: the variance of one exposure,
+    and what no further exposure averages out.
 
-    Photons, dark charge and reading (EMVA 1288 release 4.0 linear, section 2; [emva1288]), and 1/12 for
-    rounding, over the pixels of a block.
+    The first is of photons, dark charge, reading (EMVA 1288 release 4.0 linear, section 2; [emva1288]) and
+    rounding. The second is what rounding does every time alike, because the rest of the noise is too small to
+    blur the counts' steps: waves sin(2πkµ) exp(-2π²k²s²)/(πk) of a pixel's mean µ and noise s (Widrow and
+    Kollár 2008, chapter 4; [widrow2008]). Pixels of one block share their phase, but for what spreads their
+    means: the camera's pattern and the picture's slope.
     """
-    camera = design.camera
+    camera, pixels = design.camera, BLOCK[0] * BLOCK[1]
     dark_e = camera.dark_current_e_s * camera.exposure_ms * 1e-3 * camera.binning**2
     gain = np.asarray(gain, np.float32).reshape(-1, *(1,) * (counts.ndim - 1))
-    electrons = np.maximum(counts, 0.0) * gain + camera.read_noise_e**2 + dark_e
-    return np.asarray((electrons / gain**2 + 1.0 / 12.0) / (BLOCK[0] * BLOCK[1]), np.float32)
+    light = np.maximum(counts, 0.0)
+    noise = (light * gain + camera.read_noise_e**2 + dark_e) / gain**2
+    slopes = np.gradient(counts, axis=(-2, -1))
+    spread = (camera.dsnu_e / gain) ** 2 + (0.01 * camera.prnu_percent * light) ** 2
+    spread = spread + (slopes[0] ** 2 + slopes[1] ** 2) / 12.0
+    blur, shared = (np.exp(-4.0 * np.pi**2 * one, dtype=np.float32) for one in (noise, spread))
+    stays, random = np.zeros_like(blur), (noise + 1.0 / 12.0) / pixels
+    for k in range(1, _HARMONICS + 1):
+        wave, together = blur ** (k * k) / np.float32(2.0 * np.pi**2 * k * k), shared ** (k * k)
+        stays += wave * (together + (1.0 - together) / pixels)
+        random -= wave / pixels
+    return np.asarray(random, np.float32), np.asarray(stays, np.float32)
+
+
+def mean_variance(
+    design: Design, counts: NDArray[np.floating], gain: NDArray[np.floating], frames: float
+) -> Single:
+    """Return the same of means, for counts (..., 2, r, c) of pictures and references: pictures are the mean
+    of so many exposures, references of as many, but `REFERENCE_FRAMES` at least."""
+    random, stays = noise_variance(design, counts, gain)
+    count = np.array([frames, max(frames, REFERENCE_FRAMES)], np.float32).reshape(2, 1, 1)
+    return random / count + stays
 
 
 def simulate(
@@ -171,7 +198,7 @@ def simulate(
     brightness = Brightness.of(chain, values)
     k = len(features.spread)
     present, absent = np.empty((n, k), np.float32), np.empty((n, k), np.float32)
-    noise, reference = (np.empty((n, _DRAWS, k), np.float32) for _ in range(2))
+    noise, reference, stays = (np.empty((n, _DRAWS, k), np.float32) for _ in range(3))
     rng = np.random.default_rng([seed, 1])
     flat = onto.reshape(-1, 2, onto.shape[2], k)
     for rows in _slices(n, 128):
@@ -179,17 +206,19 @@ def simulate(
         seen = misaligned_share(seen, np.random.default_rng([seed, 2, rows.start]))
         present[rows] = features(seen)
         absent[rows] = features(np.stack([seen[:, :, 1], seen[:, :, 1]], axis=2))
-        spread = np.sqrt(noise_variance(chain.design, seen, brightness.gain[rows]))
-        spread = spread.reshape(*spread.shape[:3], -1)
+        spreads = [np.sqrt(one) for one in noise_variance(chain.design, seen, brightness.gain[rows])]
+        once, always = (one.reshape(*one.shape[:3], -1) for one in spreads)
         for draw in range(_DRAWS):
             for place, pool in ((0, noise), (1, reference)):
-                one = spread[:, :, place] * rng.standard_normal(spread[:, :, place].shape, np.float32)
+                one = once[:, :, place] * rng.standard_normal(once[:, :, place].shape, np.float32)
                 pool[rows, draw] = np.einsum("nlm,lmk->nk", one, flat[:, place], optimize=True)
+            one = always * rng.standard_normal(always.shape, np.float32)
+            stays[rows, draw] = np.einsum("nlpm,lpmk->nk", one, flat, optimize=True)
         tell(rows.stop / n)
     low, high = np.asarray(ranges, np.float64).T
     truth = np.array([[one[name] for name in WANTED] for one in values])
     return Simulated(
-        ((truth - low) / (high - low)).astype(np.float32), present, absent, noise, reference, error
+        ((truth - low) / (high - low)).astype(np.float32), present, absent, noise, reference, stays, error
     )
 
 

@@ -26,7 +26,7 @@ Floats = NDArray[np.float64]
 Single = NDArray[np.float32]
 
 _RENDERS = 2
-_NEAR = 0.5  # standard deviations that a fit may have moved since it was rendered
+_NEAR = 2.0  # standard deviations that a fit may have moved since it was rendered
 _REMAINS = 0.05  # of the map's error after its correction nearby (see `tests/test_refining.py`)
 _STRANGE = 1e-4  # chance of a misfit, below which the noise does not explain it
 _NODES = 9  # moduli at which all else is fitted

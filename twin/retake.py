@@ -29,6 +29,8 @@ from twin.design import Design
 
 Float = NDArray[np.float32]
 
+_HARMONICS = 6  # of rounding
+
 
 def average(picture: NDArray[Any], block: tuple[int, int]) -> Float:
     """Return means over blocks of so many rows and columns, (rows, columns[, 3]) float32.
@@ -140,6 +142,30 @@ def counts(
         variance *= rng.standard_normal(variance.shape, dtype=np.float32)
         found += variance
     return np.clip(found, 0.0, 2.0**camera.bits - 1, out=found)
+
+
+def mean_of(
+    design: Design, layers: NDArray[Any], frames: int, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """Return the mean of many exposures of layers (n_led, rows, columns[, 3]), counts, in one draw.
+
+    What the mean of a pixel's rounded counts tends to is µ + Σ (-1)^k sin(2πkµ) exp(-2π²k²s²)/(πk), at its
+    mean µ and noise s before rounding (Widrow and Kollár 2008, chapter 4; [widrow2008]); about that it is
+    normal. Where no pixel reaches the full well or an end of the range.
+    """
+    camera = design.camera
+    response, offset = fixed_pattern(camera)
+    seen = through(design.sensor(), np.asarray(layers, np.float64).sum(axis=0))
+    charge = mean_electrons(camera, seen, design.light.wavelength_nm) * response
+    charge += camera.dark_current_e_s * camera.exposure_ms * 1e-3 * camera.binning**2
+    found = (charge + offset) / camera.gain_e_per_dn + camera.offset_dn
+    variance = (charge + camera.read_noise_e**2) / camera.gain_e_per_dn**2
+    turn, blur, spread = 2.0 * np.pi * found, np.exp(-2.0 * np.pi**2 * variance), variance + 1.0 / 12.0
+    for k in range(1, _HARMONICS + 1):
+        part = blur ** (k * k)
+        found = found + (-1) ** k / (np.pi * k) * np.sin(k * turn) * part
+        spread = spread - part**2 / (2.0 * np.pi**2 * k * k)
+    return np.asarray(found + np.sqrt(np.maximum(spread, 0.0) / frames) * rng.standard_normal(found.shape))
 
 
 def averaging(design: Design, frames: int) -> Design:

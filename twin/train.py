@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 import fem
 from estimation import light_map
 from estimation.features import Features, compress
-from estimation.posterior import MOST_FRAMES, REFERENCE_FRAMES, Simulated, Training, restored
+from estimation.posterior import MOST_FRAMES, Simulated, Training, restored
 from estimation.posterior import train as train_network
 from scenes import traced
 from twin import assess, likeness
@@ -41,8 +41,8 @@ from twin.imagined import (
     WANTED,
     Brightness,
     inputs_of,
+    mean_variance,
     misaligned_share,
-    noise_variance,
     pictures,
     simulate,
     specimens,
@@ -124,7 +124,7 @@ def train(
     groups = np.array([plan.group(int(number)) for number in seen.numbers])
     seen = replace(
         seen,
-        values=[_level_names(one, chosen) for one in seen.values],
+        values=[level_names(one, chosen) for one in seen.values],
         contacts=seen.contacts[:, list(chosen)],
         charges=seen.charges[:, list(chosen)],
     )
@@ -134,7 +134,7 @@ def train(
         raise DesignError(
             "samples", received, f"{_LEAST} or more outside the group {TEST!r}", source=source.name
         )
-    many = [_level_names(one, chosen) for one in many]
+    many = [level_names(one, chosen) for one in many]
     chain, errors = learn_light(design, emulator, learning)
     inputs = inputs_of(
         chain,
@@ -203,7 +203,7 @@ def _of_levels(source: Corpus, levels: Sequence[int] | None) -> Design:
     return replace(design, press=replace(design.press, indentation_mm=depths))
 
 
-def _level_names(values: dict[str, float], levels: Sequence[int]) -> dict[str, float]:
+def level_names(values: dict[str, float], levels: Sequence[int]) -> dict[str, float]:
     """Values with the press depths of these levels only, under their new numbers."""
     start = "press.indentation_mm."
     found = {name: value for name, value in values.items() if not name.startswith(start)}
@@ -307,9 +307,8 @@ def features_of(chain: Chain, inputs: Floats, values: Sequence[dict[str, float]]
     """Return the features of pictures of these specimens."""
     bright = Brightness.of(chain, values)
     seen = misaligned_share(pictures(chain, inputs, bright), np.random.default_rng(0))
-    variance = noise_variance(chain.design, seen, bright.gain).mean(axis=(0, 3, 4))
-    reference = variance[:, 1] / REFERENCE_FRAMES
-    return compress(seen, np.sqrt(np.stack([variance[:, 0] + reference, reference], axis=1)))
+    variance = mean_variance(chain.design, seen, bright.gain, 1.0).mean(axis=(0, 3, 4))
+    return compress(seen, np.sqrt(np.stack([variance.sum(axis=1), variance[:, 1]], axis=1)))
 
 
 def likeness_of(
