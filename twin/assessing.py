@@ -12,6 +12,7 @@ import multiprocessing
 import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -21,8 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 import fem
-from estimation.detection import ideal_auc
-from twin.assess import FRAMES, Answers, averaged, figures, found_or_not, stored, summed_up
+from twin import ablation
+from twin.assess import FRAMES, averaged, stored, summed_up
+from twin.assessment import METHODS, SHORT, answered, record_of
 from twin.complaint import DesignError, shown
 from twin.corpus import Corpus
 from twin.estimates import NAMES
@@ -31,13 +33,7 @@ from twin.report import write_json
 from twin.train import TEST, level_names
 
 SAMPLES, RECORD, PICTURE = "samples", "assessment.json", "assessment.png"
-METHODS = ("network", "rendered")
-_ALL = 1e3
-SIZES = ((2.0, 3.0), (3.0, 4.0), (4.0, 8.0), (8.0, np.inf))
-DEPTHS = ((0.0, 8.0), (8.0, np.inf))
-"""Sizes and depths, mm, by which presence is told."""
 _DRAWS = 4000
-_NUMBERS = ("mean", "sd", "low", "high", "rank")
 
 
 @dataclass(frozen=True)
@@ -50,22 +46,6 @@ class Task:
     place: Path
     rendered: bool
     seed: int
-
-
-@dataclass(frozen=True)
-class Answered:
-    """Answers to all inclusions of a corpus by one method from means of so many exposures.
-
-    Attributes
-    ----------
-    numbers : (n,) of the samples.
-    truth, limits : (n, 3), limits are standard deviations of the bound.
-    """
-
-    numbers: NDArray[np.int64]
-    truth: NDArray[np.float64]
-    limits: NDArray[np.float64]
-    answers: Answers
 
 
 def assess(
@@ -119,7 +99,7 @@ def assess(
             pool.shutdown(wait=False, cancel_futures=True)
             raise
     rows = [json.loads(task.place.read_bytes()) for task in tasks]
-    record = {**told, "corpus_name": source.name, **_record(rows, estimator, rendered)}
+    record = {**told, "corpus_name": source.name, **record_of(rows, estimator.prior.ranges, rendered)}
     from twin.assessing_figure import draw
 
     write_json(folder / RECORD, record)
@@ -189,6 +169,10 @@ def answer(task: Task) -> None:
         "truth": None if blank else [values[name] for name in NAMES],
         "rendered": task.rendered,
     }
+    if not blank:
+        with suppress(fem.NotModelled):
+            parts = ablation.bounds(estimator.chain, estimator.prior, values)
+            row["parts"] = {name: sd.tolist() for name, sd in parts.items()}
     off = None
     for frames in FRAMES:
         if frames == 1:
@@ -225,113 +209,7 @@ def answer(task: Task) -> None:
 
 def _short(drawn: NDArray[np.float64], truth: NDArray[np.float64]) -> dict[str, list[float]]:
     one = summed_up(drawn[None, :, : len(NAMES)], truth)
-    return {name: getattr(one, name)[0].tolist() for name in _NUMBERS}
-
-
-def answered(rows: list[dict[str, Any]], frames: int, method: str) -> Answered:
-    """Return all inclusions' answers from their records."""
-    there = [row for row in rows if not row["blank"]]
-    parts = [row[str(frames)] for row in there]
-    short = {name: np.array([part[method][name] for part in parts]).reshape(-1, 3) for name in _NUMBERS}
-    limits = [part["bound"] or [np.nan] * len(NAMES) for part in parts]
-    return Answered(
-        np.array([row["sample"] for row in there], np.int64),
-        np.array([row["truth"] for row in there]).reshape(-1, 3),
-        np.array(limits).reshape(-1, 3),
-        Answers(**short),
-    )
-
-
-def _record(rows: list[dict[str, Any]], estimator: Estimator, rendered: bool) -> dict[str, Any]:
-    blank = np.array([row["blank"] for row in rows])
-    found: dict[str, Any] = {"inclusions": int((~blank).sum()), "blanks": int(blank.sum())}
-    for frames in FRAMES:
-        part: dict[str, Any] = {}
-        for method in METHODS[: 1 + rendered]:
-            one = answered(rows, frames, method)
-            part[method] = figures(one.answers, one.truth, one.limits, estimator.prior.ranges)
-        presence = np.array([row[str(frames)]["presence"] for row in rows])
-        truth = np.array([row["truth"] for row in rows if not row["blank"]]).reshape(-1, 3)
-        part["presence"] = found_or_not(presence, blank, truth)
-        ideal = np.array([row[str(frames)]["deflection"] or np.nan for row in rows if not row["blank"]])
-        if part["presence"]:
-            part["presence"]["beside_ideal"] = _beside_ideal(presence, blank, truth, ideal)
-        if rendered:
-            tried = [row[str(frames)] for row in rows if not row["blank"]]
-            part["explained_by_rendering"] = float(np.mean([one.get("explains", False) for one in tried]))
-            part["renders"] = float(np.mean([one.get("renders", 0) for one in tried]))
-        found[str(frames)] = part
-    return found
-
-
-def _beside_ideal(
-    presence: NDArray[np.float64],
-    blank: NDArray[np.bool_],
-    truth: NDArray[np.float64],
-    deflection: NDArray[np.float64],
-) -> list[dict[str, Any]]:
-    """Areas under the curve of the network and of an ideal observer, by size and depth."""
-    empty, full = presence[blank], presence[~blank]
-    if not len(empty):
-        return []
-    area = (full[:, None] > empty).mean(axis=1) + 0.5 * (full[:, None] == empty).mean(axis=1)
-    ideal = ideal_auc(deflection)
-    found = []
-    for low, high in SIZES:
-        for shallow, deep in DEPTHS:
-            size, depth = truth[:, 0], truth[:, 1]
-            rows = (size >= low) & (size < high) & (depth >= shallow) & (depth < deep)
-            if rows.any():
-                found.append(
-                    {
-                        "size_mm": [low, high],
-                        "depth_mm": [shallow, deep],
-                        "inclusions": int(rows.sum()),
-                        "area": float(area[rows].mean()),
-                        "ideal": float(np.nanmean(ideal[rows])),
-                    }
-                )
-    return found
-
-
-def words(record: Mapping[str, Any], out: str) -> str:
-    """Return what a person wants to know of an assessment, several lines."""
-    lines = [f"{record['inclusions']} inclusions, {record['blanks']} blanks of {record['corpus_name']}"]
-    for frames in FRAMES:
-        for method in METHODS:
-            one = record[str(frames)].get(method)
-            for size in ("4 mm and more", "8 mm and more"):
-                part = one and one.get(size)
-                if not part:
-                    continue
-                told = ", ".join(
-                    f"{short} {part['rmse'][key]:.3g} ({part['over_bound'][key]:.2f} x bound)"
-                    for short, key in zip(("d", "h", "E"), NAMES, strict=True)
-                )
-                lines.append(
-                    f"{frames:>3} exposure{'s' if frames > 1 else ' '} {method:<8} {part['samples']:>3} of "
-                    f"{size}: RMSE {told}; E explained {100 * part['explained'][NAMES[2]]:.0f} %"
-                )
-            if one:
-                covered = ", ".join(f"{100 * value:.0f} %" for value in one["covered_90"].values())
-                ranks = ", ".join(f"{value:.2g}" for value in one["rank_p"].values())
-                lines.append(f"      90 % intervals cover {covered}; ranks p {ranks}")
-        presence = record[str(frames)]["presence"]
-        if presence.get("beside_ideal"):
-            lines.append(
-                f"      inclusion or none: area under the curve {presence['area']:.4f}; by size and depth:"
-            )
-            for cell in presence["beside_ideal"]:
-                size, depth = (_span(*cell[name]) for name in ("size_mm", "depth_mm"))
-                lines.append(
-                    f"        {cell['inclusions']:>3} of {size}, {depth} deep: {cell['area']:.3f}, "
-                    f"ideal observer {cell['ideal']:.3f}"
-                )
-    return "\n".join([*lines, f"look at: {Path(out) / PICTURE}"])
-
-
-def _span(low: float, high: float) -> str:
-    return f"{low:g} mm and more" if high > _ALL else f"{low:g} to {high:g} mm"
+    return {name: getattr(one, name)[0].tolist() for name in SHORT}
 
 
 def _one_thread() -> None:

@@ -16,7 +16,7 @@ from twin.report import BLUE, GREY, INK, RED, panels
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from twin.assessing import Answered
+    from twin.assessment import Answered
 
 _LABELS = ("size d / mm", "depth h / mm", "modulus E / kPa")
 _COLOURS = (BLUE, RED)

@@ -41,7 +41,7 @@ def _assess(arguments: argparse.Namespace) -> int:
     for flag, value in (("--samples", arguments.samples), ("--workers", arguments.workers)):
         if value == 0:
             raise DesignError(flag, "0", "an integer >= 1")
-    from twin import assessing
+    from twin import assessing, assessment
     from twin.reporting import Reporter
 
     with Reporter() as report:
@@ -55,7 +55,8 @@ def _assess(arguments: argparse.Namespace) -> int:
             seed=arguments.seed,
             progress=report,
         )
-    print(assessing.words(record, arguments.out))
+    print(assessment.words(record))
+    print(f"look at: {Path(arguments.out) / assessing.PICTURE}")
     return 0
 
 

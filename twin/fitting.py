@@ -93,14 +93,29 @@ class Fitted:
 
 def expected(chain: Chain, prior: Prior, many: Sequence[Floats]) -> NDArray[np.float32]:
     """Return expected counts above black (n, levels, 2, r, c) at unknowns (5 + q,) each."""
+    inputs, values = _inputs(chain, prior, many)
+    return pictures(chain, inputs, Brightness.of(chain, values))
+
+
+def expected_layers(chain: Chain, prior: Prior, many: Sequence[Floats]) -> NDArray[np.float32]:
+    """Return the same with one LED alight at a time, (n, levels, 2, n_led, r, c)."""
+    inputs, values = _inputs(chain, prior, many)
+    bright = Brightness.of(chain, values)
+    charges = chain.light.at(inputs.reshape(-1, inputs.shape[-1]))
+    scale = bright.flux_W / bright.gain[:, None]
+    charges = charges.reshape(*inputs.shape[:3], *chain.light.shape)
+    return np.asarray(charges * scale[:, None, None, :, None, None], np.float32)
+
+
+def _inputs(chain: Chain, prior: Prior, many: Sequence[Floats]) -> tuple[Floats, list[dict[str, float]]]:
+    """The light map's inputs (n, levels, 2, k) and the values by name; equal contacts are computed once."""
     values = [_reachable(chain, prior.values(x)) for x in many]
     contact = [tuple(v for k, v in one.items() if not _bright(k)) for one in values]
     first: dict[tuple[float, ...], int] = {}
     for key in contact:
         first.setdefault(key, len(first))
     chosen = [values[contact.index(key)] for key in first]
-    inputs = chain.inputs(chosen)[[first[key] for key in contact]]
-    return pictures(chain, inputs, Brightness.of(chain, values))
+    return chain.inputs(chosen)[[first[key] for key in contact]], values
 
 
 def _reachable(chain: Chain, values: dict[str, float]) -> dict[str, float]:
@@ -128,6 +143,14 @@ def _bright(name: str) -> bool:
 
 def jacobian(chain: Chain, features: Features, prior: Prior, x: Floats) -> tuple[NDArray[np.float32], Floats]:
     """Return the pictures (levels, 2, r, c) at unknowns x, and derivatives (5 + q, k) of their features."""
+    ends, apart = differences(prior, x)
+    seen = expected(chain, prior, [x, *ends])
+    found = features(seen[1:]).astype(np.float64)
+    return seen[0], (found[1::2] - found[::2]) / apart[:, None]
+
+
+def differences(prior: Prior, x: Floats) -> tuple[list[Floats], Floats]:
+    """Return unknowns a step below and above x for each of them in turn, and how far these are apart."""
     steps = np.array([*(_STEPS[name] for name in PARAMETERS), *[_NUISANCE_STEP] * (len(x) - 5)])
     ends = []
     for number, step in enumerate(steps):
@@ -137,10 +160,7 @@ def jacobian(chain: Chain, features: Features, prior: Prior, x: Floats) -> tuple
             if number < 5:
                 end[number] = np.clip(end[number], *prior.ranges[number])
             ends.append(end)
-    seen = expected(chain, prior, [x, *ends])
-    found = features(seen[1:]).astype(np.float64)
-    apart = np.array([ends[2 * n + 1][n] - ends[2 * n][n] for n in range(len(x))])
-    return seen[0], (found[1::2] - found[::2]) / apart[:, None]
+    return ends, np.array([ends[2 * n + 1][n] - ends[2 * n][n] for n in range(len(x))])
 
 
 def covariance(

@@ -1,0 +1,108 @@
+"""What an assessment says of answers whose worth is known, and what parts of a picture are worth."""
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+
+from estimation.scalars import scalars
+from twin import ablation, assessing
+from twin.assess import figures, summed_up
+from twin.assessing_figure import draw
+from twin.assessment import answered, record_of, words
+from twin.complaint import DesignError
+
+RANGES = np.array([[2.0, 13.0], [4.0, 12.0], [40.0, 120.0], [-2.0, 2.0], [-2.0, 2.0]])
+SD = np.array([0.1, 0.05, 10.0])
+
+
+def inclusions(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Truth (n, 3), and samples (n, 500, 3) of normal posteriors that are right."""
+    rng = np.random.default_rng(seed)
+    truth = rng.uniform([4.0, 4.0, 60.0], [13.0, 12.0, 100.0], (n, 3))
+    middle = truth + SD * rng.standard_normal((n, 3))
+    return truth, middle[:, None] + SD * rng.standard_normal((n, 500, 3))
+
+
+def test_right_posteriors_are_called_right() -> None:
+    truth, drawn = inclusions(800)
+    told = figures(summed_up(drawn, truth), truth, np.tile(SD, (800, 1)), RANGES)
+    part = told["4 mm and more"]
+    assert all(abs(ratio - 1.0) < 0.08 for ratio in part["over_bound"].values())
+    assert all(abs(share - 1.0) < 0.05 for share in part["explained"].values())
+    assert all(abs(share - 0.9) < 0.03 for share in told["covered_90"].values())
+    assert all(p > 1e-3 for p in told["rank_p"].values())
+
+
+def test_posteriors_that_are_too_sure_are_found_out() -> None:
+    truth, drawn = inclusions(800)
+    sure = drawn.mean(axis=1, keepdims=True) + 0.5 * (drawn - drawn.mean(axis=1, keepdims=True))
+    told = figures(summed_up(sure, truth), truth, np.tile(SD, (800, 1)), RANGES)
+    assert all(share < 0.7 for share in told["covered_90"].values())
+    assert all(p < 1e-6 for p in told["rank_p"].values())
+
+
+def rows(n: int = 40) -> list[dict[str, Any]]:
+    """Records of samples as a run leaves them, an eighth without inclusion."""
+    truth, drawn = inclusions(n)
+    found = []
+    for number in range(n):
+        blank = number % 8 == 0
+        row: dict[str, Any] = {"sample": number, "blank": blank, "rendered": True}
+        row["truth"] = None if blank else truth[number].tolist()
+        for frames in ("1", "100"):
+            row[frames] = {"presence": 0.01 if blank else 0.99}
+            if not blank:
+                one = assessing._short(drawn[number], truth[number : number + 1])
+                row[frames] |= {"network": one, "rendered": one, "bound": SD.tolist(), "deflection": 9.0}
+                row[frames] |= {"explains": True, "renders": 1, "misfit": 1.0}
+        if not blank:
+            row["parts"] = {"all levels": SD.tolist()}
+        found.append(json.loads(json.dumps(row)))
+    return found
+
+
+def test_the_record_tells_all_that_the_words_say(tmp_path: Any) -> None:
+    record = record_of(rows(), RANGES, True) | {"corpus_name": "made up"}
+    assert record["inclusions"] == 35 and record["blanks"] == 5
+    assert record["1"]["presence"]["area"] == 1.0
+    text = words(record)
+    assert "35 inclusions, 5 blanks" in text and "ideal observer 1.000" in text and "all levels" in text
+    draw(
+        {frames: answered(rows(), frames, "rendered") for frames in (1, 100)}, RANGES, 5.0, tmp_path / "a.png"
+    )
+    assert (tmp_path / "a.png").stat().st_size > 20_000
+
+
+def test_a_folder_of_something_else_is_left_alone(tmp_path: Any) -> None:
+    told = {"model": "a", "corpus": "b", "seed": 0, "format": 1}
+    assessing._claim(tmp_path / "new", told)
+    assessing._claim(tmp_path / "new", told)
+    with pytest.raises(DesignError, match="same model, corpus and seed"):
+        assessing._claim(tmp_path / "new", told | {"seed": 1})
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "letter.txt").write_text("dear")
+    with pytest.raises(DesignError, match="--out"):
+        assessing._claim(tmp_path / "mine", told)
+
+
+def test_information_of_the_scalars_is_that_of_noisy_pictures() -> None:
+    """Means and covariance of the paper's scalars over pictures with noise, against the closed form."""
+    y, x = np.mgrid[-1:1:4j, -1:1:5j]
+    coarse = 20.0 * np.exp(-2.0 * (x**2 + y**2))
+    sd, threshold, side = 1.5, 10.0, ablation.BLOCK
+    rng = np.random.default_rng(0)
+
+    def seen(scale: float, count: int) -> np.ndarray:
+        pixels = np.kron(scale * coarse, np.ones(side))
+        found = [scalars(pixels + sd * rng.standard_normal(pixels.shape), threshold) for _ in range(count)]
+        return np.array([[one["max_dn"], one["total_dn"], one["area_px"]] for one in found])
+
+    many = 3000
+    covariance = np.cov(seen(1.0, many).T)
+    slope = (seen(1.05, many).mean(axis=0) - seen(0.95, many).mean(axis=0)) / 0.1
+    expected = slope @ np.linalg.solve(covariance, slope)
+    variance = np.full((1, 4, 5), sd**2 / (side[0] * side[1]))
+    told = ablation._scalars(coarse[None], coarse[None, None], variance, threshold)
+    assert told[0, 0] == pytest.approx(expected, rel=0.08)
