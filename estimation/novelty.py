@@ -25,7 +25,8 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import eigh
-from scipy.ndimage import map_coordinates
+
+from estimation.alignment import moved
 
 Float = NDArray[np.float64]
 
@@ -119,17 +120,8 @@ def misaligned(pictures: ArrayLike, rng: np.random.Generator, percent: float = 1
     given = np.asarray(pictures, np.float64)
     if given.ndim != 4:
         raise ValueError(f"pictures: received shape {given.shape}, allowed: (n, levels, rows, columns)")
-    rows, columns = given.shape[2:]
-    middle = np.array([rows - 1, columns - 1])[:, None, None] / 2
-    grid = np.indices((rows, columns)) - middle
-    out = np.empty_like(given)
-    for picture, place in zip(given, out, strict=True):
-        x, y, larger, turn = 0.01 * percent * rng.standard_normal(4)
-        turned = np.cos(turn) * grid + np.sin(turn) * np.stack([grid[1], -grid[0]])
-        at = turned / (1.0 + larger) + middle + max(rows, columns) * np.array([y, x])[:, None, None]
-        for level, target in zip(picture, place, strict=True):
-            map_coordinates(level, at, output=target, order=3, mode="nearest")
-    return out
+    draws = 0.01 * percent * rng.standard_normal((len(given), 4))
+    return np.stack([moved(one, *draw) for one, draw in zip(given, draws, strict=True)])
 
 
 def _judged(

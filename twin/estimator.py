@@ -84,7 +84,8 @@ class Estimator:
         """Return what is known after the pictures; ``samples`` of the posterior are drawn from ``seed``.
 
         The network's answer is refined by rendering (`refining.refine`; ten seconds), unless ``rendered`` is
-        False, the pictures are refused or hold no inclusion, or what is rendered does not explain them.
+        False, the pictures are refused or hold no inclusion, or what is rendered does not explain them, even
+        if the camera stands a little off.
         """
         seen, frames = self.coarse(received), exposures(received)
         counts = seen + black(self.chain)
@@ -97,11 +98,17 @@ class Estimator:
             reason = f"pictures unlike this sensor's: {strangest}"
         refined = None
         if rendered and self.traced and reason is None and presence >= 0.5:
-            refined = self.refined(told[0], frames, drawn.mean(axis=0), samples=samples, seed=seed)
+            start = drawn.mean(axis=0)
+            refined = self.refined(told[0], frames, start, samples=samples, seed=seed)
+            if refined is not None and not refined.explains:
+                again = self.refined(
+                    told[0], frames, start, samples=samples, seed=seed, prior=self.prior.aligned()
+                )
+                refined = again or refined
         fitted = self.fitted(told[0], frames, drawn.mean(axis=0)) if refined is None else refined.fitted
         trusted = refined is not None and refined.explains
         wanted = (refined.samples if refined is not None and trusted else drawn)[:, : len(NAMES)]
-        gain = np.array([self.chain.gain(self.prior.values(fitted.x))])
+        gain = np.array([self.chain.gain(self.prior.values(fitted.x[: len(self.prior.middle)]))])
         variance = mean_variance(self.chain.design, seen[None], gain, frames)[0]
         expected = fitted.pictures if refined is None else fitted.pictures + refined.off
         return Estimate(
@@ -129,16 +136,18 @@ class Estimator:
         samples: int = 4000,
         seed: int = 0,
         begin: Off | None = None,
+        prior: Prior | None = None,
         threads: int | None = None,
     ) -> Refined | None:
         """Return the posterior of features (k,) by rendering, from a start (5,); None where the best fit lies
         beyond what the emulator or the learned light know."""
-        x = np.concatenate([start, np.zeros(self.prior.basis.shape[1])])
+        prior = prior or self.prior
+        x = np.concatenate([start, np.zeros(prior.basis.shape[1])])
         try:
             return refine(
                 self.chain,
                 self.features,
-                self.prior,
+                prior,
                 self.error,
                 told,
                 frames,

@@ -13,14 +13,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from estimation.alignment import moved
 from estimation.features import Features
 from fem.sampling import clearance
 from twin.chain import Chain
 from twin.imagined import Brightness, mean_variance, pictures
+from twin.likeness import MISALIGNED_PERCENT
 from twin.study import PARAMETERS
 
 Floats = NDArray[np.float64]
 
+ALIGNMENT = ("camera.shift_x", "camera.shift_y", "camera.larger", "camera.turn")
+"""Arguments of `alignment.moved`, as unknowns of a specimen's pictures."""
 _STEPS = {"size_mm": 0.02, "depth_mm": 0.02, "modulus_kPa": 0.5, "offset_x_mm": 0.02, "offset_y_mm": 0.02}
 _NUISANCE_STEP = 0.1  # standard deviations
 _MOST = 12  # Gauss-Newton steps
@@ -52,6 +56,16 @@ class Prior:
     def middle(self) -> Floats:
         """(5 + q,) the prior's mean."""
         return np.concatenate([self.ranges.mean(axis=1), np.zeros(self.basis.shape[1])])
+
+    def aligned(self) -> Prior:
+        """Return the prior of a camera of which nobody knows exactly where it stands."""
+        more, (m, q) = len(ALIGNMENT), self.basis.shape
+        basis = np.zeros((m + more, q + more))
+        basis[:m, :q] = self.basis
+        basis[m:, q:] = 0.01 * MISALIGNED_PERCENT * np.eye(more)
+        return Prior(
+            self.ranges, (*self.names, *ALIGNMENT), np.concatenate([self.mean, np.zeros(more)]), basis
+        )
 
     def values(self, x: Floats) -> dict[str, float]:
         """Return the values by name of unknowns (5 + q,)."""
@@ -94,7 +108,15 @@ class Fitted:
 def expected(chain: Chain, prior: Prior, many: Sequence[Floats]) -> NDArray[np.float32]:
     """Return expected counts above black (n, levels, 2, r, c) at unknowns (5 + q,) each."""
     inputs, values = _inputs(chain, prior, many)
-    return pictures(chain, inputs, Brightness.of(chain, values))
+    return placed(pictures(chain, inputs, Brightness.of(chain, values)), values)
+
+
+def placed(seen: NDArray[np.float32], many: Sequence[Mapping[str, float]]) -> NDArray[np.float32]:
+    """Return pictures (n, levels, 2, r, c) as the camera of each sees them from where it stands."""
+    for one, values in zip(seen, many, strict=True):
+        if off := [values[name] for name in ALIGNMENT if name in values]:
+            one[...] = moved(one.reshape(-1, *one.shape[-2:]), *off).reshape(one.shape)
+    return seen
 
 
 def expected_layers(chain: Chain, prior: Prior, many: Sequence[Floats]) -> NDArray[np.float32]:
@@ -138,7 +160,7 @@ def _reachable(chain: Chain, values: dict[str, float]) -> dict[str, float]:
 
 
 def _bright(name: str) -> bool:
-    return name.startswith("leds.") or name == "camera.gain_e_per_dn"
+    return name.startswith(("leds.", "camera."))
 
 
 def jacobian(chain: Chain, features: Features, prior: Prior, x: Floats) -> tuple[NDArray[np.float32], Floats]:

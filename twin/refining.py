@@ -20,7 +20,7 @@ from scipy.interpolate import CubicSpline, interp1d
 
 from estimation.features import Features
 from twin.chain import Chain
-from twin.fitting import Fitted, Prior, covariance, fit, inside, jacobian
+from twin.fitting import Fitted, Prior, covariance, fit, inside, jacobian, placed
 
 Floats = NDArray[np.float64]
 Single = NDArray[np.float32]
@@ -28,7 +28,8 @@ Single = NDArray[np.float32]
 _RENDERS = 2
 _NEAR = 2.0  # standard deviations that a fit may have moved since it was rendered
 _REMAINS = 0.05  # of the map's error after its correction nearby (see `tests/test_refining.py`)
-_STRANGE = 1e-4  # chance of a misfit, below which the noise does not explain it
+_STRANGE = 1e-4  # chance of a misfit, below which the noise is taken to be louder than told
+_LOUDEST = 3.0  # times its variance that are believed
 _NODES = 9  # moduli at which all else is fitted
 _REACH = 3.5  # standard deviations that they go away from the most probable
 _STEPS = 2  # of Gauss and Newton at each, from its neighbour
@@ -49,7 +50,8 @@ class Refined:
     samples : (n, 5).
     fitted : the most probable specimen, by the chain.
     off : what to add to the chain's pictures nearby.
-    explains : whether the noise explains the rest: if not, these pictures are not what is rendered.
+    explains : whether noise explains the rest, up to `_LOUDEST` times the variance that is known of: a camera
+        may be noisier than told. If not, these pictures are not what is rendered.
     renders : how many specimens were rendered.
     """
 
@@ -88,15 +90,18 @@ def refine(
     remains = _REMAINS**2 * error
     for renders in range(1, _RENDERS + 1):  # noqa: B007
         at = found
-        off = render(prior.values(at.x)) - at.pictures
+        values = prior.values(at.x)
+        off = placed(render(values)[None], [values])[0] - at.pictures
         found = fit(chain, features, prior, observed - _of(features, off), frames, at.x, remains)
         moved = np.abs(found.x - at.x) / np.sqrt(np.diag(found.covariance))
         if moved[:5].max() < _NEAR:
             break
     corrected = observed - _of(features, off)
-    drawn = valley(chain, features, prior, corrected, frames, found, remains).draw(prior, samples, seed)
-    explains = bool(stats.chi2.sf(found.chi_square, len(features.spread)) > _STRANGE)
-    return Refined(drawn, found, off, explains, renders)
+    k = len(features.spread)
+    usual = stats.chi2.sf(found.chi_square, k) > _STRANGE
+    louder = 1.0 if usual else found.chi_square / k
+    followed = valley(chain, features, prior, corrected, frames, found, remains, louder)
+    return Refined(followed.draw(prior, samples, seed), found, off, bool(louder < _LOUDEST), renders)
 
 
 def _of(features: Features, off: Off) -> Floats:
@@ -143,8 +148,12 @@ def valley(
     frames: float,
     fitted: Fitted,
     error: Floats,
+    louder: float = 1.0,
 ) -> Valley:
-    """Follow the posterior from modulus to modulus, away from the most probable specimen."""
+    """Follow the posterior from modulus to modulus, away from the most probable specimen.
+
+    ``louder`` multiplies the noise's variance.
+    """
     sd = float(np.sqrt(fitted.covariance[_HELD, _HELD]))
     top = float(fitted.x[_HELD])
     low = max(top - _REACH * sd, prior.ranges[_HELD, 0])
@@ -153,7 +162,7 @@ def valley(
     first = int(np.argmin(np.abs(moduli - top)))
     rest = np.delete(np.arange(len(fitted.x)), _HELD)
     gain = chain.gain(prior.values(fitted.x))
-    noise = linalg.cho_factor(covariance(chain, features, fitted.pictures, gain, frames) + error)
+    noise = linalg.cho_factor(louder * covariance(chain, features, fitted.pictures, gain, frames) + error)
     slope = fitted.covariance[rest, _HELD] / fitted.covariance[_HELD, _HELD]
     found: dict[int, tuple[Floats, float, Floats]] = {}
     begin = fitted.x.copy()
