@@ -21,6 +21,7 @@ from twin.complaint import DesignError, shown
 from twin.design import Design
 from twin.fields import expand, tables_of
 from twin.plan import Plan
+from twin.retake import squares
 from twin.settling import Setting, drawn
 from twin.study import PARAMETERS, parse_study
 
@@ -29,7 +30,6 @@ Floats = NDArray[np.float64]
 
 WANTED = PARAMETERS
 _AT_ONCE = 64  # specimens whose contacts are worked out together
-_HARMONICS = 6  # of rounding
 _DRAWS = 4  # of noise for every specimen
 MISALIGNED_PERCENT = 1.0
 
@@ -159,8 +159,8 @@ def noise_variance(
     spread = spread + (slopes[0] ** 2 + slopes[1] ** 2) / 12.0
     blur, shared = (np.exp(-4.0 * np.pi**2 * one, dtype=np.float32) for one in (noise, spread))
     stays, random = np.zeros_like(blur), (noise + 1.0 / 12.0) / pixels
-    for k in range(1, _HARMONICS + 1):
-        wave, together = blur ** (k * k) / np.float32(2.0 * np.pi**2 * k * k), shared ** (k * k)
+    for k, (wave, together) in enumerate(zip(squares(blur), squares(shared), strict=True), start=1):
+        wave /= np.float32(2.0 * np.pi**2 * k * k)
         stays += wave * (together + (1.0 - together) / pixels)
         random -= wave / pixels
     return np.asarray(random, np.float32), np.asarray(stays, np.float32)

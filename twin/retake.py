@@ -14,6 +14,7 @@ by the camera again. Two ways to take it:
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -161,11 +162,19 @@ def mean_of(
     found = (charge + offset) / camera.gain_e_per_dn + camera.offset_dn
     variance = (charge + camera.read_noise_e**2) / camera.gain_e_per_dn**2
     turn, blur, spread = 2.0 * np.pi * found, np.exp(-2.0 * np.pi**2 * variance), variance + 1.0 / 12.0
-    for k in range(1, _HARMONICS + 1):
-        part = blur ** (k * k)
+    for k, part in enumerate(squares(blur), start=1):
         found = found + (-1) ** k / (np.pi * k) * np.sin(k * turn) * part
         spread = spread - part**2 / (2.0 * np.pi**2 * k * k)
     return np.asarray(found + np.sqrt(np.maximum(spread, 0.0) / frames) * rng.standard_normal(found.shape))
+
+
+def squares(blur: NDArray[Any]) -> Iterator[NDArray[Any]]:
+    """Yield blur^(k²) for k of 1 to `_HARMONICS`, new arrays each."""
+    power, odd, twice = blur.copy(), blur, blur * blur
+    for _ in range(_HARMONICS):
+        yield power.copy()
+        odd = odd * twice
+        power *= odd
 
 
 def averaging(design: Design, frames: int) -> Design:
