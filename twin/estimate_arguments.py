@@ -62,6 +62,15 @@ def add(verbs: Any) -> None:
     train.add_argument(
         "--minutes", type=number(above=0.0), default=20.0, metavar="MIN", help="time to train (default 20)"
     )
+    train.add_argument(
+        "--samples",
+        type=whole,
+        metavar="N",
+        help="samples that light is learned from, at most (default: all)",
+    )
+    train.add_argument(
+        "--imagined", type=whole, metavar="N", help="specimens that the network is shown (default 16000)"
+    )
     train.add_argument("--seed", type=whole, default=0, metavar="N", help="of all random numbers (default 0)")
 
     assess = add_verb(verbs, "assess", "how well a model tells inclusions that it has not seen", _ASSESS)

@@ -19,8 +19,11 @@ def _train(arguments: argparse.Namespace) -> int:
     levels = arguments.levels
     if levels is not None and len(set(levels)) < len(levels):
         raise DesignError("--levels", shown(levels), "each press level once")
+    for flag, value, least in (("--samples", arguments.samples, 30), ("--imagined", arguments.imagined, 100)):
+        if value is not None and value < least:
+            raise DesignError(flag, str(value), f"an integer >= {least}")
     from twin.reporting import Reporter
-    from twin.train import train
+    from twin.train import IMAGINED, train
 
     with Reporter() as report:
         written = train(
@@ -28,6 +31,8 @@ def _train(arguments: argparse.Namespace) -> int:
             arguments.out.removesuffix(".safetensors"),
             levels=levels,
             minutes=arguments.minutes,
+            samples=arguments.samples,
+            imagined=arguments.imagined or IMAGINED,
             seed=arguments.seed,
             progress=report,
         )

@@ -93,6 +93,7 @@ def train(
     minutes: float = 20.0,
     seed: int = 0,
     imagined: int = IMAGINED,
+    samples: int | None = None,
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> str:
@@ -102,7 +103,8 @@ def train(
     ----------
     levels : press levels to use, by number; all by default.
     minutes : the longest that the network is trained.
-    imagined : specimens that it is trained on.
+    imagined : specimens that it is trained on, 100 or more.
+    samples : of the corpus that the light map is learned from, at most; all by default.
 
     Raises
     ------
@@ -128,7 +130,7 @@ def train(
         contacts=seen.contacts[:, list(chosen)],
         charges=seen.charges[:, list(chosen)],
     )
-    learning, testing = seen.of(groups != TEST), seen.of(groups == TEST)
+    learning, testing = seen.of(np.flatnonzero(groups != TEST)[:samples]), seen.of(groups == TEST)
     if len(learning.numbers) < _LEAST:
         received = f"{len(learning.numbers)} samples"
         raise DesignError(
@@ -150,7 +152,8 @@ def train(
         chain, features, inputs, many, ranges, error, seed, lambda s: tell("noise", 0.4 + 0.1 * s)
     )
     key = hashlib.sha256(
-        repr((plan.head.samples.sha256, chosen, seed, imagined, versions())).encode() + told.present.tobytes()
+        repr((plan.head.samples.sha256, chosen, seed, imagined, samples, versions())).encode()
+        + told.present.tobytes()
     ).hexdigest()[:16]
     network = _network(told, parts / f"{key}.safetensors", minutes, seed, tell)
     estimator = Estimator(
