@@ -98,13 +98,7 @@ class Estimator:
             reason = f"pictures unlike this sensor's: {strangest}"
         refined = None
         if rendered and self.traced and reason is None and presence >= 0.5:
-            start = drawn.mean(axis=0)
-            refined = self.refined(told[0], frames, start, samples=samples, seed=seed)
-            if refined is not None and not refined.explains:
-                again = self.refined(
-                    told[0], frames, start, samples=samples, seed=seed, prior=self.prior.aligned()
-                )
-                refined = again or refined
+            refined = self.refined(told[0], frames, drawn.mean(axis=0), samples=samples, seed=seed)
         fitted = self.fitted(told[0], frames, drawn.mean(axis=0)) if refined is None else refined.fitted
         trusted = refined is not None and refined.explains
         wanted = (refined.samples if refined is not None and trusted else drawn)[:, : len(NAMES)]
@@ -136,29 +130,35 @@ class Estimator:
         samples: int = 4000,
         seed: int = 0,
         begin: Off | None = None,
-        prior: Prior | None = None,
         threads: int | None = None,
     ) -> Refined | None:
         """Return the posterior of features (k,) by rendering, from a start (5,); None where the best fit lies
-        beyond what the emulator or the learned light know."""
-        prior = prior or self.prior
-        x = np.concatenate([start, np.zeros(prior.basis.shape[1])])
-        try:
-            return refine(
-                self.chain,
-                self.features,
-                prior,
-                self.error,
-                told,
-                frames,
-                x,
-                lambda values: render(self.chain, self.traced, values, threads=threads),
-                samples=samples,
-                seed=seed,
-                begin=begin,
-            )
-        except (fem.NotModelled, NotModelled):
-            return None
+        beyond what the emulator or the learned light know.
+
+        Pictures that are not explained are taken as those of a camera that stands a little off.
+        """
+        found = None
+        for prior in (self.prior, self.prior.aligned()):
+            x = np.concatenate([start, np.zeros(prior.basis.shape[1])])
+            try:
+                found = refine(
+                    self.chain,
+                    self.features,
+                    prior,
+                    self.error,
+                    told,
+                    frames,
+                    x,
+                    lambda values: render(self.chain, self.traced, values, threads=threads),
+                    samples=samples,
+                    seed=seed,
+                    begin=begin,
+                )
+            except (fem.NotModelled, NotModelled):
+                continue
+            if found.explains:
+                break
+        return found
 
     def coarse(self, received: Received) -> Single:
         """Return coarse counts above black, (levels, 2, r, c)."""
