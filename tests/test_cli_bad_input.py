@@ -89,6 +89,29 @@ FLAGS = {
         [*FINE, "--mechanics", "emulator", "--emulator", "."],
         ["--emulator", "'.'", "twin emulate"],
     ),
+    "traced light that is not there": (
+        [*FINE, "--traced", "no/such.npz"],
+        ["traced", "'no/such.npz'", "--light"],
+    ),
+    "traced light that is none": ([*FINE, "--traced", "."], ["traced", "'.'", "--light"]),
+    "traced light and its noise": ([*FINE, "--traced", "a.npz", "--noise", "1"], ["traced", "with noise"]),
+    "traced light at reference quality": (
+        [*FINE, "--traced", "a.npz", "--quality", "reference"],
+        ["traced", "reference quality"],
+    ),
+    "training on next to nothing": (
+        ["train", "c", "--samples", "3", "--out", "m"],
+        ["--samples", "3", ">= 30"],
+    ),
+    "an assessment without a place": (["assess", "m", "c"], ["--out", "folder"]),
+    "an assessment of no corpus": (
+        ["assess", "m", "c", "--out", "a"],
+        ["CORPUS", "'c'", "folder of a corpus"],
+    ),
+    "an assessment of no samples": (
+        ["assess", "m", "c", "--samples", "0", "--out", "a"],
+        ["--samples", ">= 1"],
+    ),
     "an emulator without its mechanics": (
         [*FINE, "--emulator", "a.npz"],
         ["--emulator", "--mechanics emulator"],

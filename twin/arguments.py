@@ -126,6 +126,9 @@ def _parser() -> Parser:
     simulate.add_argument(
         "--emulator", metavar="FILE.npz", help="for --mechanics emulator (default emulators/DESIGN.npz)"
     )
+    simulate.add_argument(
+        "--traced", metavar="FILE.npz", help="traced light without noise, of `twin emulate DESIGN --light`"
+    )
     press = simulate.add_mutually_exclusive_group()
     _add_depths(press)
     press.add_argument(

@@ -114,6 +114,7 @@ def _run(arguments: argparse.Namespace) -> int:
             arguments.mechanics = None
         elif arguments.emulator is not None:
             raise DesignError("--emulator", "it with other mechanics", "it with --mechanics emulator only")
+        options["traced"] = arguments.traced
         design, inclusion = _pressed(arguments), _inclusion(arguments)
         levels = arguments.force or arguments.indentation or design.press.indentation_mm
         _simulate(arguments, design, inclusion, levels, bool(arguments.force), options)

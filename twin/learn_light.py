@@ -106,6 +106,16 @@ def learn_light(
     return learned
 
 
+def light_of(file: str | Path) -> tuple[TracedLight, ...]:
+    """Return the light of each band from a file of `learn_light`; raises `DesignError` for others."""
+    from scenes import traced
+
+    try:
+        return traced.load(file)
+    except (OSError, traced.NotModelled):
+        raise DesignError("traced", shown(str(file)), "a file of `twin emulate --light`") from None
+
+
 def tasks_of(
     design: Design, emulator: fem.Emulator, file: str, samples: int, seed: int, folder: Path
 ) -> list[Task]:

@@ -22,6 +22,7 @@ from twin.design import Design, load_design, parse_design, shipped_designs
 from twin.draws import check_bounds
 from twin.fields import expand, number_at, tables_of
 from twin.frame import versions
+from twin.learn_light import light_of
 from twin.planned import (
     EMULATOR,
     FORMAT,
@@ -40,7 +41,7 @@ from twin.stage import staged
 from twin.study import MAX_COUNT, PARAMETERS, CorpusMechanics, Distribution, Source, load_study
 
 if TYPE_CHECKING:
-    from scenes.traced import TracedLight
+    pass
 
 __all__ = ["Plan", "freeze", "load_plan"]
 
@@ -177,17 +178,8 @@ def _setting(source: Source, design: Design, seed: int, file: Path | None, trace
     for one in varied:
         check_bounds(f"randomise.{one.field}", one.distribution, one.base)
     emulator = None if file is None else presses.emulator_of(design, file)
-    light = None if traced is None else _traced_light(traced)
+    light = None if traced is None else light_of(traced)
     return Setting(seed, tables, design, varied, emulator, light)
-
-
-def _traced_light(file: Path) -> tuple[TracedLight, ...]:
-    from scenes import traced
-
-    try:
-        return traced.load(file)
-    except OSError:
-        raise DesignError("traced", shown(str(file)), "a file of `twin emulate --light`") from None
 
 
 def _joined(setting: Setting, groups: Sequence[Drawn]) -> tuple[list[str], Columns]:

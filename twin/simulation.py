@@ -29,6 +29,7 @@ from twin.presses import Mechanics, Quality
 if TYPE_CHECKING:
     from fem import Emulated, Emulator, Press
     from scenes import Rendering, SpectralRenderer
+    from scenes.traced import TracedLight
 
 Device = Literal["auto", "cpu", "cuda"]
 Progress = Callable[[str, float], None]
@@ -51,6 +52,15 @@ class _Work:
         self.progress(stage, done / (self.mechanics + self.light * self.levels))
 
 
+class _Light(TypedDict):
+    """How to light a press; the same with and without the inclusion, so that their noise cancels."""
+
+    quality: Quality
+    noise: float | None
+    traced: tuple[TracedLight, ...] | None
+    seed: int
+
+
 class Options(TypedDict, total=False):
     """What `simulate` takes beside the press, for whichever form of it."""
 
@@ -60,6 +70,7 @@ class Options(TypedDict, total=False):
     position: Sequence[float] | None
     quality: Quality
     noise: float | None
+    traced: str | Path | None
     seed: SupportsIndex
     device: Device
     progress: Progress | None
@@ -101,6 +112,7 @@ def simulate(
     position: Sequence[float] | None = None,
     quality: Quality = "standard",
     noise: float | None = None,
+    traced: str | Path | None = None,
     seed: SupportsIndex = 0,
     device: Device = "auto",
     progress: Progress | None = None,
@@ -121,6 +133,7 @@ def simulate(
     position : centre of the sensor minus that of the specimen, mm, instead of the design's.
     quality : "preview", "standard" or "reference", for mechanics and light alike.
     noise : go on with the light until its noise is at most this, rms of a pixel in per cent of the mean.
+    traced : file of `twin emulate --light`: light that walked far is taken from it and leaves no noise.
     seed : of the light's and the camera's random numbers. One level's frame does not depend on the others,
         but for the last digits of its mechanics, which are found on one way through all levels.
     device : "auto" (a CUDA GPU where there is one), "cpu" or "cuda".
@@ -138,6 +151,14 @@ def simulate(
     seed = _seed(seed)
     if noise is not None and not 0.0 < noise < float("inf"):
         raise DesignError("noise", shown(noise), "a number > 0, per cent")
+    light = None
+    if traced is not None:
+        if quality == "reference" or noise is not None:
+            given = "it with reference quality" if noise is None else "it with noise"
+            raise DesignError("traced", given, "it with preview or standard light, which then has no noise")
+        from twin.learn_light import light_of
+
+        light = light_of(traced)
     pressed: Sequence[Press | Emulated] | None = None
     if mechanics == "emulator":
         known = presses.emulator_of(design, emulator)
@@ -166,7 +187,8 @@ def simulate(
             work.tell(stage, 1.0, number + share)
 
         tell(0.0)
-        frames.append(_frame(design, inclusion, press, renderer, quality, noise, seed, level, tell))
+        options: _Light = {"quality": quality, "noise": noise, "traced": light, "seed": light_seed(seed)}
+        frames.append(_frame(design, inclusion, press, renderer, options, seed, level, tell))
     return frames if several else frames[0]
 
 
@@ -201,8 +223,7 @@ def _frame(
     inclusion: fem.Inclusion | None,
     press: Press | Emulated,
     renderer: SpectralRenderer,
-    quality: Quality,
-    noise: float | None,
+    options: _Light,
     seed: int,
     level: float,
     tell: Callable[[float], None],
@@ -213,9 +234,7 @@ def _frame(
         return renderer.render(
             press.surface,
             field=field,
-            quality=quality,
-            noise=noise,
-            seed=light_seed(seed),  # the same with and without the inclusion, so that their noise cancels
+            **options,
             progress=lambda share: tell(before + 0.5 * share),
         )
 
