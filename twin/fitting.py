@@ -227,7 +227,7 @@ def fit(
         weighted = np.linalg.solve(noise, slopes.T)
         rest = observed - features(seen[None])[0]
         information = slopes @ weighted + precision
-        step = np.linalg.solve(information, weighted.T @ rest - precision @ (x - prior.middle))
+        step = _step(prior, x, information, weighted.T @ rest - precision @ (x - prior.middle))
         inverse = np.asarray(np.linalg.inv(information))
         found = Fitted(x, inverse, float(rest @ np.linalg.solve(noise, rest)), seen)
         size = np.abs(step) / np.sqrt(np.diag(inverse))
@@ -236,6 +236,29 @@ def fit(
             break
     assert found is not None
     return found
+
+
+def _step(prior: Prior, x: Floats, information: Floats, slope: Floats) -> Floats:
+    """Return the step of Gauss and Newton to the best place that lies within the prior's ranges.
+
+    What is at the end of its range and wants to go on is held, and the others go where they are best then;
+    the step ends where the next one comes to its end.
+    """
+    low, high = prior.ranges.T
+    free = np.ones(len(x), np.bool_)
+    step = np.zeros(len(x))
+    for _ in range(len(low) + 1):
+        step[:] = 0.0
+        step[free] = np.linalg.solve(information[np.ix_(free, free)], slope[free])
+        ahead = x[:5] + step[:5]
+        stuck = free[:5] & (((x[:5] <= low) & (ahead < low)) | ((x[:5] >= high) & (ahead > high)))
+        if not stuck.any():
+            break
+        free[:5] &= ~stuck
+    ends = np.where(step[:5] > 0.0, high, low) - x[:5]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shares = np.where(step[:5] != 0.0, ends / step[:5], np.inf)
+    return np.asarray(step * min(1.0, float(shares.min())))
 
 
 def _stepped(

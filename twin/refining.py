@@ -25,7 +25,8 @@ from twin.fitting import Fitted, Prior, covariance, fit, inside, jacobian, place
 Floats = NDArray[np.float64]
 Single = NDArray[np.float32]
 
-_RENDERS = 2
+_RENDERS = 5
+_STILL = 0.1  # standard deviations that do not matter
 _NEAR = 2.0  # standard deviations that a fit may have moved since it was rendered
 _REMAINS = 0.05  # of the map's error after its correction nearby (see `tests/test_refining.py`)
 _STRANGE = 1e-4  # chance of a misfit, below which the noise is taken to be louder than told
@@ -93,15 +94,19 @@ def refine(
         values = prior.values(at.x)
         off = placed(render(values)[None], [values])[0] - at.pictures
         found = fit(chain, features, prior, observed - _of(features, off), frames, at.x, remains)
-        moved = np.abs(found.x - at.x) / np.sqrt(np.diag(found.covariance))
-        if moved[:5].max() < _NEAR:
+        moved = float((np.abs(found.x - at.x) / np.sqrt(np.diag(found.covariance)))[:5].max())
+        if moved < _STILL or (moved < _NEAR and not _strange(found, features)):
             break
     corrected = observed - _of(features, off)
     k = len(features.spread)
-    usual = stats.chi2.sf(found.chi_square, k) > _STRANGE
-    louder = 1.0 if usual else found.chi_square / k
+    louder = found.chi_square / k if _strange(found, features) else 1.0
     followed = valley(chain, features, prior, corrected, frames, found, remains, louder)
     return Refined(followed.draw(prior, samples, seed), found, off, bool(louder < _LOUDEST), renders)
+
+
+def _strange(found: Fitted, features: Features) -> bool:
+    """Whether noise as it is known does not explain what is left."""
+    return bool(stats.chi2.sf(found.chi_square, len(features.spread)) < _STRANGE)
 
 
 def _of(features: Features, off: Off) -> Floats:
