@@ -43,8 +43,9 @@ class Features:
 
 @pytest.fixture(autouse=True)
 def simple(monkeypatch: pytest.MonkeyPatch) -> None:
-    def expected(chain: Any, prior: Prior, many: Any) -> NDArray[Any]:
-        return light_map(np.array(many)).reshape(-1, *Features.shape)
+    def expected(chain: Any, prior: Prior, many: Any, near: Any = None) -> NDArray[Any]:
+        seen = light_map(np.array(many)).reshape(-1, *Features.shape)
+        return seen if near is None else seen + near.of(many)
 
     def covariance(chain: Any, features: Any, seen: Any, gain: float, frames: float) -> NDArray[Any]:
         return np.eye(K) * NOISE**2 / frames

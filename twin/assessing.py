@@ -173,7 +173,7 @@ def answer(task: Task) -> None:
         with suppress(fem.NotModelled):
             parts = ablation.bounds(estimator.chain, estimator.prior, values)
             row["parts"] = {name: sd.tolist() for name, sd in parts.items()}
-    off = None
+    near = None
     for frames in FRAMES:
         if frames == 1:
             seen = stored(estimator, source, task.sample, levels)
@@ -194,10 +194,10 @@ def answer(task: Task) -> None:
             found["bound"] = found["deflection"] = None
         if task.rendered and estimator.traced:
             refined = estimator.refined(
-                told[0], frames, drawn.mean(axis=0), samples=_DRAWS, seed=task.seed, begin=off, threads=1
+                told[0], frames, drawn.mean(axis=0), samples=_DRAWS, seed=task.seed, begin=near, threads=1
             )
             if refined is not None:
-                off = refined.off
+                near = refined.near
                 found["misfit"] = refined.fitted.chi_square / len(estimator.features.spread)
                 found["renders"], found["explains"] = refined.renders, refined.explains
                 if refined.explains:

@@ -33,10 +33,10 @@ from twin.chain import BLOCK, Chain, whole_blocks
 from twin.complaint import DesignError, shown
 from twin.design import parse_design
 from twin.estimates import NAMES, Estimate
-from twin.fitting import Fitted, Prior, fit, limits
+from twin.fitting import Fitted, Near, Prior, fit, limits
 from twin.imagined import mean_variance
 from twin.received import Received
-from twin.refining import Off, Refined, refine
+from twin.refining import Refined, refine
 from twin.rendered import rendered as render
 from twin.retake import average
 
@@ -104,7 +104,7 @@ class Estimator:
         wanted = (refined.samples if refined is not None and trusted else drawn)[:, : len(NAMES)]
         gain = np.array([self.chain.gain(self.prior.values(fitted.x[: len(self.prior.middle)]))])
         variance = mean_variance(self.chain.design, seen[None], gain, frames)[0]
-        expected = fitted.pictures if refined is None else fitted.pictures + refined.off
+        expected = fitted.pictures
         return Estimate(
             NAMES,
             wanted,
@@ -129,7 +129,7 @@ class Estimator:
         *,
         samples: int = 4000,
         seed: int = 0,
-        begin: Off | None = None,
+        begin: Near | None = None,
         threads: int | None = None,
     ) -> Refined | None:
         """Return the posterior of features (k,) by rendering, from a start (5,); None where the best fit lies
@@ -152,7 +152,7 @@ class Estimator:
                     lambda values: render(self.chain, self.traced, values, threads=threads),
                     samples=samples,
                     seed=seed,
-                    begin=begin,
+                    begin=begin if begin is not None and len(begin.at) == len(x) else None,
                 )
             except (fem.NotModelled, NotModelled):
                 continue

@@ -105,10 +105,35 @@ class Fitted:
     pictures: NDArray[np.float32]
 
 
-def expected(chain: Chain, prior: Prior, many: Sequence[Floats]) -> NDArray[np.float32]:
+@dataclass(frozen=True)
+class Near:
+    """How far rendered pictures are above the chain's around a specimen: off + Σ slope (along · (x - at)).
+
+    Attributes
+    ----------
+    at : (5 + q,) the specimen.
+    off : (levels, 2, r, c) counts there.
+    along, slopes : (m, 5 + q) and (m, levels, 2, r, c) how that changes, as far as it is known.
+    """
+
+    at: Floats
+    off: NDArray[np.float32]
+    along: Floats
+    slopes: NDArray[np.float32]
+
+    def of(self, many: Sequence[Floats]) -> NDArray[np.float32]:
+        """Return the difference at unknowns (5 + q,) each, (n, levels, 2, r, c)."""
+        amounts = (np.stack(many) - self.at) @ self.along.T
+        return np.asarray(self.off + np.tensordot(amounts, self.slopes, 1), np.float32)
+
+
+def expected(
+    chain: Chain, prior: Prior, many: Sequence[Floats], near: Near | None = None
+) -> NDArray[np.float32]:
     """Return expected counts above black (n, levels, 2, r, c) at unknowns (5 + q,) each."""
     inputs, values = _inputs(chain, prior, many)
-    return placed(pictures(chain, inputs, Brightness.of(chain, values)), values)
+    seen = placed(pictures(chain, inputs, Brightness.of(chain, values)), values)
+    return seen if near is None else seen + near.of(many)
 
 
 def placed(seen: NDArray[np.float32], many: Sequence[Mapping[str, float]]) -> NDArray[np.float32]:
@@ -163,10 +188,12 @@ def _bright(name: str) -> bool:
     return name.startswith(("leds.", "camera."))
 
 
-def jacobian(chain: Chain, features: Features, prior: Prior, x: Floats) -> tuple[NDArray[np.float32], Floats]:
+def jacobian(
+    chain: Chain, features: Features, prior: Prior, x: Floats, near: Near | None = None
+) -> tuple[NDArray[np.float32], Floats]:
     """Return the pictures (levels, 2, r, c) at unknowns x, and derivatives (5 + q, k) of their features."""
     ends, apart = differences(prior, x)
-    seen = expected(chain, prior, [x, *ends])
+    seen = expected(chain, prior, [x, *ends], near)
     found = features(seen[1:]).astype(np.float64)
     return seen[0], (found[1::2] - found[::2]) / apart[:, None]
 
@@ -210,6 +237,7 @@ def fit(
     frames: float,
     start: Floats,
     error: Floats | None = None,
+    near: Near | None = None,
 ) -> Fitted:
     """Return the most probable specimen for features (k,) of pictures that are means of so many exposures.
 
@@ -217,11 +245,12 @@ def fit(
     ----------
     start : (5 + q,) where to begin.
     error : (k, k) covariance of the chain's own errors.
+    near : what is known of these errors around the start.
     """
     x, precision = inside(prior, start), prior.precision
     found: Fitted | None = None
     for _ in range(_MOST):
-        seen, slopes = jacobian(chain, features, prior, x)
+        seen, slopes = jacobian(chain, features, prior, x, near)
         gain = chain.gain(prior.values(x))
         noise = covariance(chain, features, seen, gain, frames) + (0.0 if error is None else error)
         weighted = np.linalg.solve(noise, slopes.T)
@@ -231,7 +260,7 @@ def fit(
         inverse = np.asarray(np.linalg.inv(information))
         found = Fitted(x, inverse, float(rest @ np.linalg.solve(noise, rest)), seen)
         size = np.abs(step) / np.sqrt(np.diag(inverse))
-        x = inside(prior, _stepped(chain, features, prior, x, step, observed, noise))
+        x = inside(prior, _stepped(chain, features, prior, x, step, observed, noise, near))
         if size.max() < _DONE:
             break
     assert found is not None
@@ -269,11 +298,12 @@ def _stepped(
     step: Floats,
     observed: NDArray[np.floating],
     noise: Floats,
+    near: Near | None,
 ) -> Floats:
     """Go the longest of a few halved steps that lowers the sum of squares."""
     shares = (0.0, 1.0, 0.5, 0.2, 0.05)
     tried = [inside(prior, x + share * step) for share in shares]
-    rest = observed - features(expected(chain, prior, tried))
+    rest = observed - features(expected(chain, prior, tried, near))
     away = np.stack(tried) - prior.middle
     cost = np.einsum("nk,nk->n", rest, np.linalg.solve(noise, rest.T).T)
     cost += np.einsum("ni,ij,nj->n", away, prior.precision, away)

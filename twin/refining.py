@@ -11,7 +11,7 @@ marginals: Tierney and Kadane 1986, [tierney1986]).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,14 +20,16 @@ from scipy.interpolate import CubicSpline, interp1d
 
 from estimation.features import Features
 from twin.chain import Chain
-from twin.fitting import Fitted, Prior, covariance, fit, inside, jacobian, placed
+from twin.fitting import Fitted, Near, Prior, covariance, fit, inside, jacobian, placed
 
 Floats = NDArray[np.float64]
 Single = NDArray[np.float32]
 
 _RENDERS = 5
 _STILL = 0.1  # standard deviations that do not matter
-_NEAR = 2.0  # standard deviations that a fit may have moved since it was rendered
+_FIRST, _NEAR = 0.3, 1.0
+"""Standard deviations that a fit may move after the first rendering, and after one that tells how the map's
+error changes, without another."""
 _REMAINS = 0.05  # of the map's error after its correction nearby (see `tests/test_refining.py`)
 _STRANGE = 1e-4  # chance of a misfit, below which the noise is taken to be louder than told
 _LOUDEST = 3.0  # times its variance that are believed
@@ -38,10 +40,6 @@ _FINE = 800  # moduli in between
 _HELD = 2  # the modulus, among `PARAMETERS`
 
 
-Off = NDArray[np.float32]
-"""(levels, 2, r, c) counts by which rendered pictures are above the chain's, near one specimen."""
-
-
 @dataclass(frozen=True)
 class Refined:
     """A posterior of (size, depth, modulus, offset x, offset y), given that there is an inclusion.
@@ -50,7 +48,7 @@ class Refined:
     ----------
     samples : (n, 5).
     fitted : the most probable specimen, by the chain.
-    off : what to add to the chain's pictures nearby.
+    near : what to add to the chain's pictures around it.
     explains : whether noise explains the rest, up to `_LOUDEST` times the variance that is known of: a camera
         may be noisier than told. If not, these pictures are not what is rendered.
     renders : how many specimens were rendered.
@@ -58,7 +56,7 @@ class Refined:
 
     samples: Floats
     fitted: Fitted
-    off: Off
+    near: Near
     explains: bool
     renders: int
 
@@ -75,7 +73,7 @@ def refine(
     *,
     samples: int = 4000,
     seed: int = 0,
-    begin: Off | None = None,
+    begin: Near | None = None,
 ) -> Refined:
     """Return the posterior for features (k,) of pictures that are means of so many exposures.
 
@@ -86,32 +84,42 @@ def refine(
     render : expected pictures (levels, 2, r, c) of a specimen's values, by light transport.
     begin : what is known of the light map's errors near the start, from pictures of the same specimen.
     """
-    off = np.zeros(features.shape, np.float32) if begin is None else begin
-    found = fit(chain, features, prior, observed - _of(features, off), frames, start, error)
+    near = begin
     remains = _REMAINS**2 * error
+    found = fit(chain, features, prior, observed, frames, start, error if near is None else remains, near)
     for renders in range(1, _RENDERS + 1):  # noqa: B007
-        at = found
-        values = prior.values(at.x)
-        off = placed(render(values)[None], [values])[0] - at.pictures
-        found = fit(chain, features, prior, observed - _of(features, off), frames, at.x, remains)
-        moved = float((np.abs(found.x - at.x) / np.sqrt(np.diag(found.covariance)))[:5].max())
-        if moved < _STILL or (moved < _NEAR and not _strange(found, features)):
+        at, metric = found.x, np.asarray(np.linalg.inv(found.covariance))
+        values = prior.values(at)
+        plain = found.pictures if near is None else found.pictures - near.of([at])[0]
+        near = _corrected(near, at, placed(render(values)[None], [values])[0] - plain, metric)
+        found = fit(chain, features, prior, observed, frames, at, remains, near)
+        moved = float((np.abs(found.x - at) / np.sqrt(np.diag(found.covariance)))[:5].max())
+        enough = _NEAR if len(near.slopes) else _FIRST
+        if moved < _STILL or (moved < enough and not _strange(found, features)):
             break
-    corrected = observed - _of(features, off)
-    k = len(features.spread)
-    louder = found.chi_square / k if _strange(found, features) else 1.0
-    followed = valley(chain, features, prior, corrected, frames, found, remains, louder)
-    return Refined(followed.draw(prior, samples, seed), found, off, bool(louder < _LOUDEST), renders)
+    assert near is not None
+    louder = found.chi_square / len(features.spread) if _strange(found, features) else 1.0
+    followed = valley(chain, features, prior, observed, frames, found, remains, near, louder)
+    return Refined(followed.draw(prior, samples, seed), found, near, bool(louder < _LOUDEST), renders)
+
+
+def _corrected(near: Near | None, at: Floats, off: Single, metric: Floats) -> Near:
+    """Return what is known after one more rendering: how the map's error changed on the way there goes on in
+    this direction (Broyden 1965; [broyden1965])."""
+    if near is None:
+        return Near(at, off, np.zeros((0, len(at))), np.zeros((0, *off.shape), np.float32))
+    way = at - near.at
+    length = float(way @ metric @ way)
+    if length < _STILL**2:
+        return replace(near, at=at, off=off)
+    slope = (off - near.of([at])[0])[None]
+    along = (metric @ way / length)[None]
+    return Near(at, off, np.concatenate([near.along, along]), np.concatenate([near.slopes, slope]))
 
 
 def _strange(found: Fitted, features: Features) -> bool:
     """Whether noise as it is known does not explain what is left."""
     return bool(stats.chi2.sf(found.chi_square, len(features.spread)) < _STRANGE)
-
-
-def _of(features: Features, off: Off) -> Floats:
-    """Features (k,) that a difference of pictures adds."""
-    return np.asarray(features(off[None])[0] - features(np.zeros_like(off)[None])[0], np.float64)
 
 
 @dataclass(frozen=True)
@@ -149,10 +157,11 @@ def valley(
     chain: Chain,
     features: Features,
     prior: Prior,
-    observed: Floats,
+    observed: NDArray[np.floating],
     frames: float,
     fitted: Fitted,
     error: Floats,
+    near: Near,
     louder: float = 1.0,
 ) -> Valley:
     """Follow the posterior from modulus to modulus, away from the most probable specimen.
@@ -174,12 +183,12 @@ def valley(
     begin[rest] += slope * (moduli[first] - top)
     for way in (range(first, _NODES), range(first - 1, -1, -1)):
         for node in way:
-            near = [found[n][0] for n in (node - 1, node + 1) if n in found]
+            next_ = [found[n][0] for n in (node - 1, node + 1) if n in found]
             beyond = [found[n][0] for n in (node - 2, node + 2) if n in found]
-            start = begin if not near else 2.0 * near[0] - beyond[0] if beyond else near[0]
+            start = begin if not next_ else 2.0 * next_[0] - beyond[0] if beyond else next_[0]
             start = start.copy()
             start[_HELD] = moduli[node]
-            found[node] = _held(chain, features, prior, observed, noise, start, rest)
+            found[node] = _held(chain, features, prior, observed, noise, start, rest, near)
     nodes = [found[n] for n in range(_NODES)]
     return Valley(
         moduli,
@@ -193,17 +202,18 @@ def _held(
     chain: Chain,
     features: Features,
     prior: Prior,
-    observed: Floats,
+    observed: NDArray[np.floating],
     noise: tuple[Floats, bool],
     start: Floats,
     rest: NDArray[np.intp],
+    near: Near,
 ) -> tuple[Floats, float, Floats]:
     """Most probable unknowns with the modulus held, log density there, and covariance of the others."""
     x = start
     precision = prior.precision[np.ix_(rest, rest)]
     for step in range(_STEPS + 1):
         x = inside(prior, x)
-        seen, slopes = jacobian(chain, features, prior, x)
+        seen, slopes = jacobian(chain, features, prior, x, near)
         away = observed - features(seen[None])[0]
         weighted = linalg.cho_solve(noise, slopes[rest].T)
         inverse = np.linalg.inv(slopes[rest] @ weighted + precision)
