@@ -8,10 +8,8 @@ another light tells what a mismatch of the model costs.
 from __future__ import annotations
 
 import json
-import multiprocessing
 import os
 from collections.abc import Callable, Mapping
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
@@ -29,6 +27,7 @@ from twin.complaint import DesignError, shown
 from twin.corpus import Corpus
 from twin.estimates import NAMES
 from twin.estimator import Estimator, load_estimator
+from twin.pooled import each
 from twin.report import write_json
 from twin.train import TEST, level_names
 
@@ -88,16 +87,12 @@ def assess(
         for number in numbers
     ]
     left = [task for task in tasks if not _done(task)]
-    progress("samples", 1.0 - len(left) / max(len(tasks), 1))
-    pool = ProcessPoolExecutor(workers or os.cpu_count(), multiprocessing.get_context("spawn"), _one_thread)
-    with pool:
-        try:
-            for count, one in enumerate(as_completed([pool.submit(answer, task) for task in left]), start=1):
-                one.result()
-                progress("samples", 1.0 - (len(left) - count) / len(tasks))
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+
+    def share(count: int) -> None:
+        progress("samples", 1.0 - (len(left) - count) / max(len(tasks), 1))
+
+    share(0)
+    each(answer, left, workers or os.cpu_count() or 1, _one_thread, share)
     rows = [json.loads(task.place.read_bytes()) for task in tasks]
     record = {**told, "corpus_name": source.name, **record_of(rows, estimator.prior.ranges, rendered)}
     from twin.assessing_figure import draw

@@ -6,10 +6,8 @@ same call goes on with them. What is learned is `scenes.traced.TracedLight`.
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,6 +21,7 @@ from twin import presses
 from twin.complaint import DesignError, shown
 from twin.design import Design, parse_design
 from twin.fields import put, tables_of
+from twin.pooled import each
 from twin.stage import check_file, staged_file
 
 if TYPE_CHECKING:
@@ -85,15 +84,13 @@ def learn_light(
     tell = progress or (lambda stage, share: None)
     left = [task for task in tasks if not _kept(task)]
     tell("presses", 1.0 - len(left) / len(tasks))
-    with ProcessPoolExecutor(max(workers, 1), multiprocessing.get_context("spawn"), _one_thread) as pool:
-        try:
-            done = [pool.submit(trace, task) for task in left]
-            for number, one in enumerate(as_completed(done), start=1):
-                one.result()
-                tell("presses", 1.0 - (len(left) - number) / len(tasks))
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+    each(
+        trace,
+        left,
+        workers,
+        _one_thread,
+        lambda count: tell("presses", 1.0 - (len(left) - count) / len(tasks)),
+    )
     tell("fit", 1.0)
     sensors = spectral.band_sensors(design.sensor(), count=design.light.bands, at=design.sensor)
     found = [_read(path) for task in tasks for path in _files(task)]
