@@ -42,7 +42,7 @@ class Simulated:
     noise, reference_noise : (n, draws, k) features of noise of one exposure of the pictures, and of one of
         the references.
     stays : (n, draws, k) features of noise that further exposures do not average out.
-    error : (m, k) features of errors of the forward model, of which one is added with a random sign.
+    error : (m, k) features of errors of the forward model; what is added has their covariance and their sizes.
     """
 
     unit: Single
@@ -66,8 +66,11 @@ class Simulated:
             sign = _signs(rng, len(rows)) / np.sqrt(count, dtype=np.float32)
             found += pool[rows, draw] * sign[:, None].astype(np.float32)
         if len(self.error):
-            sign = _signs(rng, len(rows))
-            found += self.error[rng.integers(len(self.error), size=len(rows))] * sign[:, None]
+            # mixtures of all errors, as large as any of them: a few hundred themselves would be learned by heart
+            mixture = rng.standard_normal((len(rows), len(self.error)), np.float32)
+            size = np.sqrt((self.error**2).sum(axis=1))
+            scale = size[rng.integers(len(size), size=len(rows))] / max(np.sqrt((size**2).mean()), 1e-12)
+            found += mixture @ self.error * (scale / np.sqrt(len(size)))[:, None].astype(np.float32)
         return found
 
 

@@ -85,3 +85,15 @@ def test_another_networks_state_is_refused():
     state = Training.begin(linear(100), 0, **TINY).network.state_dict()
     with pytest.raises(ValueError, match="network: received another"):
         restored({"k": 5, "p": 2, **TINY}, state)
+
+
+def test_errors_of_the_model_have_their_covariance_and_are_never_the_same() -> None:
+    rng = np.random.default_rng(3)
+    error = (rng.standard_normal((60, 4)) @ np.diag([3.0, 1.0, 0.3, 2.0])).astype(np.float32)
+    told = linear(50, noise=0.0)
+    many = Simulated(*(getattr(told, name) for name in list(vars(told))[:-1]), error)
+    rows = np.zeros(40_000, int)
+    drawn = many.batch(rows, rng, np.ones(len(rows), np.float32), empty=True)
+    expected = error.T @ error / len(error)
+    assert np.cov(drawn.T) == pytest.approx(expected, abs=0.04 * np.trace(expected))
+    assert len(np.unique(drawn.round(5), axis=0)) == len(drawn)
