@@ -42,7 +42,7 @@ class Simulated:
     noise, reference_noise : (n, draws, k) features of noise of one exposure of the pictures, and of one of
         the references.
     stays : (n, draws, k) features of noise that further exposures do not average out.
-    error : (m, k) features of errors of the forward model; what is added has their covariance and their sizes.
+    error : (m, k) features of errors of the forward model; what is added has their covariance and sizes.
     """
 
     unit: Single
@@ -66,7 +66,7 @@ class Simulated:
             sign = _signs(rng, len(rows)) / np.sqrt(count, dtype=np.float32)
             found += pool[rows, draw] * sign[:, None].astype(np.float32)
         if len(self.error):
-            # mixtures of all errors, as large as any of them: a few hundred themselves would be learned by heart
+            # mixtures of all, as large as any: a few hundred themselves would be learned by heart
             mixture = rng.standard_normal((len(rows), len(self.error)), np.float32)
             size = np.sqrt((self.error**2).sum(axis=1))
             scale = size[rng.integers(len(size), size=len(rows))] / max(np.sqrt((size**2).mean()), 1e-12)

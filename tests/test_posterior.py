@@ -95,5 +95,5 @@ def test_errors_of_the_model_have_their_covariance_and_are_never_the_same() -> N
     rows = np.zeros(40_000, int)
     drawn = many.batch(rows, rng, np.ones(len(rows), np.float32), empty=True)
     expected = error.T @ error / len(error)
-    assert np.cov(drawn.T) == pytest.approx(expected, abs=0.04 * np.trace(expected))
+    assert np.cov(drawn.T) == pytest.approx(expected, abs=0.04 * float(np.trace(expected)))
     assert len(np.unique(drawn.round(5), axis=0)) == len(drawn)
