@@ -30,6 +30,7 @@ _STILL = 0.1  # standard deviations that do not matter
 _FIRST, _NEAR = 0.3, 1.0
 """Standard deviations that a fit may move after the first rendering, and after one that tells how the map's
 error changes, without another."""
+_SHORT = 1e-3  # of the prior's spread: a way that tells nothing of how the error changes
 _REMAINS = 0.05  # of the map's error after its correction nearby (see `tests/test_refining.py`)
 _STRANGE = 1e-4  # chance of a misfit, below which the noise is taken to be louder than told
 _LOUDEST = 3.0  # times its variance that are believed
@@ -88,10 +89,10 @@ def refine(
     remains = _REMAINS**2 * error
     found = fit(chain, features, prior, observed, frames, start, error if near is None else remains, near)
     for renders in range(1, _RENDERS + 1):  # noqa: B007
-        at, metric = found.x, np.asarray(np.linalg.inv(found.covariance))
+        at = found.x
         values = prior.values(at)
         plain = found.pictures if near is None else found.pictures - near.of([at])[0]
-        near = _corrected(near, at, placed(render(values)[None], [values])[0] - plain, metric)
+        near = _corrected(near, at, placed(render(values)[None], [values])[0] - plain, prior)
         found = fit(chain, features, prior, observed, frames, at, remains, near)
         moved = float((np.abs(found.x - at) / np.sqrt(np.diag(found.covariance)))[:5].max())
         enough = _NEAR if len(near.slopes) else _FIRST
@@ -103,17 +104,21 @@ def refine(
     return Refined(followed.draw(prior, samples, seed), found, near, bool(louder < _LOUDEST), renders)
 
 
-def _corrected(near: Near | None, at: Floats, off: Single, metric: Floats) -> Near:
+def _corrected(near: Near | None, at: Floats, off: Single, prior: Prior) -> Near:
     """Return what is known after one more rendering: how the map's error changed on the way there goes on in
-    this direction (Broyden 1965; [broyden1965])."""
+    this direction (Broyden 1965; [broyden1965]).
+
+    The direction is measured in the spread of the prior, over which the map's error changes; in that of the
+    posterior all of a way along the valley would be laid to the little that it goes across.
+    """
     if near is None:
         return Near(at, off, np.zeros((0, len(at))), np.zeros((0, *off.shape), np.float32))
-    way = at - near.at
-    length = float(way @ metric @ way)
-    if length < _STILL**2:
+    way, metric = at - near.at, np.diag(prior.precision)
+    length = float(way @ (metric * way))
+    if length < _SHORT**2:
         return replace(near, at=at, off=off)
     slope = (off - near.of([at])[0])[None]
-    along = (metric @ way / length)[None]
+    along = (metric * way / length)[None]
     return Near(at, off, np.concatenate([near.along, along]), np.concatenate([near.slopes, slope]))
 
 
