@@ -63,7 +63,7 @@ def test_where_the_camera_stands_is_found(monkeypatch: pytest.MonkeyPatch) -> No
     told = pixels.ravel() + 0.05 * np.random.default_rng(0).standard_normal(pixels.size)
     start = np.array([7.0, 7.0, 80.0, 0.0, 0.0])
     plain = fitting.fit(chain, features, prior, told, 1.0, start)
-    wide = prior.aligned()
+    wide = prior.of_another_camera(0.0)
     found = fitting.fit(chain, features, wide, told, 1.0, np.concatenate([start, np.zeros(4)]))
     assert plain.chi_square > 20.0 * found.chi_square
     assert found.chi_square == pytest.approx(len(told), rel=0.1)

@@ -35,12 +35,14 @@ from twin.design import parse_design
 from twin.estimates import NAMES, Estimate
 from twin.fitting import Fitted, Near, Prior, fit, limits
 from twin.imagined import mean_variance
+from twin.put_back import put_back
 from twin.received import Received
 from twin.refining import Refined, refine
 from twin.rendered import rendered as render
 from twin.retake import average
 
 FORMAT = "tsis-estimator-2"
+_LEFT_PERCENT = 0.05  # of misalignment, standard deviation, after pictures were put back
 _CARD_BYTES = 4 * 2**20
 _NEEDED = {
     "design": dict,
@@ -98,13 +100,20 @@ class Estimator:
             reason = f"pictures unlike this sensor's: {strangest}"
         refined = None
         if rendered and self.traced and reason is None and presence >= 0.5:
-            refined = self.refined(told[0], frames, drawn.mean(axis=0), samples=samples, seed=seed)
+            start = drawn.mean(axis=0)
+            refined = self.refined(told[0], frames, start, samples=samples, seed=seed)
+            if refined is None or not refined.explains:
+                parts = (self.chain, self.features, self.error, self.coarse)
+                seen = put_back(*parts, self.prior.of_another_camera(self._pattern), received, start)
+                told = self.features(seen[None])
+                prior = self.prior.of_another_camera(self._pattern, _LEFT_PERCENT)
+                again = self.refined(told[0], frames, start, samples=samples, seed=seed, prior=prior)
+                refined = again or refined
         fitted = self.fitted(told[0], frames, drawn.mean(axis=0)) if refined is None else refined.fitted
         trusted = refined is not None and refined.explains
         wanted = (refined.samples if refined is not None and trusted else drawn)[:, : len(NAMES)]
         gain = np.array([self.chain.gain(self.prior.values(fitted.x[: len(self.prior.middle)]))])
         variance = mean_variance(self.chain.design, seen[None], gain, frames)[0]
-        expected = fitted.pictures
         return Estimate(
             NAMES,
             wanted,
@@ -115,7 +124,7 @@ class Estimator:
             like,
             reason,
             np.asarray(seen[:, 0] - seen[:, 1], np.float64),
-            np.asarray(expected[:, 0] - expected[:, 1], np.float64),
+            np.asarray(fitted.pictures[:, 0] - fitted.pictures[:, 1], np.float64),
             np.sqrt(variance.sum(axis=1, dtype=np.float64)),
             "rendered" if trusted else "network",
             fitted.chi_square / len(self.features.spread),
@@ -130,35 +139,33 @@ class Estimator:
         samples: int = 4000,
         seed: int = 0,
         begin: Near | None = None,
+        prior: Prior | None = None,
         threads: int | None = None,
     ) -> Refined | None:
         """Return the posterior of features (k,) by rendering, from a start (5,); None where the best fit lies
-        beyond what the emulator or the learned light know.
+        beyond what the emulator or the learned light know."""
+        prior = prior or self.prior
+        x = np.concatenate([start, np.zeros(prior.basis.shape[1])])
+        try:
+            return refine(
+                self.chain,
+                self.features,
+                prior,
+                self.error,
+                told,
+                frames,
+                x,
+                lambda values: render(self.chain, self.traced, values, threads=threads),
+                samples=samples,
+                seed=seed,
+                begin=begin,
+            )
+        except (fem.NotModelled, NotModelled):
+            return None
 
-        Pictures that are not explained are taken as those of a camera that stands a little off.
-        """
-        found = None
-        for prior in (self.prior, self.prior.aligned()):
-            x = np.concatenate([start, np.zeros(prior.basis.shape[1])])
-            try:
-                found = refine(
-                    self.chain,
-                    self.features,
-                    prior,
-                    self.error,
-                    told,
-                    frames,
-                    x,
-                    lambda values: render(self.chain, self.traced, values, threads=threads),
-                    samples=samples,
-                    seed=seed,
-                    begin=begin if begin is not None and len(begin.at) == len(x) else None,
-                )
-            except (fem.NotModelled, NotModelled):
-                continue
-            if found.explains:
-                break
-        return found
+    @property
+    def _pattern(self) -> float:
+        return 0.01 * likeness.PATTERN * self.chain.design.camera.prnu_percent
 
     def coarse(self, received: Received) -> Single:
         """Return coarse counts above black, (levels, 2, r, c)."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from estimation.alignment import moved
 from estimation.features import Features
 from fem.sampling import clearance
-from twin.chain import Chain
+from twin.chain import BLOCK, Chain
 from twin.imagined import Brightness, mean_variance, pictures
 from twin.likeness import MISALIGNED_PERCENT
 from twin.study import PARAMETERS
@@ -39,12 +39,14 @@ class Prior:
     ----------
     names : of the other numbers.
     mean, basis : (m,) and (m, q); they are mean + basis @ t with independent t of variance one.
+    pattern : standard deviation of the camera's pixels' response about that of the design's, a share.
     """
 
     ranges: Floats
     names: tuple[str, ...]
     mean: Floats
     basis: Floats
+    pattern: float = 0.0
 
     @property
     def precision(self) -> Floats:
@@ -57,15 +59,14 @@ class Prior:
         """(5 + q,) the prior's mean."""
         return np.concatenate([self.ranges.mean(axis=1), np.zeros(self.basis.shape[1])])
 
-    def aligned(self) -> Prior:
-        """Return the prior of a camera of which nobody knows exactly where it stands."""
+    def of_another_camera(self, pattern: float, percent: float = MISALIGNED_PERCENT) -> Prior:
+        """Return the prior of a camera with another pattern, which stands nobody knows exactly where."""
         more, (m, q) = len(ALIGNMENT), self.basis.shape
         basis = np.zeros((m + more, q + more))
         basis[:m, :q] = self.basis
-        basis[m:, q:] = 0.01 * MISALIGNED_PERCENT * np.eye(more)
-        return Prior(
-            self.ranges, (*self.names, *ALIGNMENT), np.concatenate([self.mean, np.zeros(more)]), basis
-        )
+        basis[m:, q:] = 0.01 * percent * np.eye(more)
+        names, mean = (*self.names, *ALIGNMENT), np.concatenate([self.mean, np.zeros(more)])
+        return Prior(self.ranges, names, mean, basis, pattern)
 
     def values(self, x: Floats) -> dict[str, float]:
         """Return the values by name of unknowns (5 + q,)."""
@@ -213,11 +214,17 @@ def differences(prior: Prior, x: Floats) -> tuple[list[Floats], Floats]:
 
 
 def covariance(
-    chain: Chain, features: Features, seen: NDArray[np.floating], gain: float, frames: float
+    chain: Chain,
+    features: Features,
+    seen: NDArray[np.floating],
+    gain: float,
+    frames: float,
+    pattern: float = 0.0,
 ) -> Floats:
     """Return the covariance (k, k) of the features' noise in pictures (levels, 2, r, c) of so many exposures.
 
-    References are the mean of `imagined.REFERENCE_FRAMES` at least.
+    References are the mean of `imagined.REFERENCE_FRAMES` at least. ``pattern`` is that of `Prior`; it is
+    the same in all pictures.
     """
     variance = mean_variance(chain.design, seen[None], np.array([gain]), frames)[0]
     total = np.zeros((len(features.spread),) * 2)
@@ -226,6 +233,10 @@ def covariance(
         for level in range(len(seen)):
             axes = onto[level, place]
             total += (axes * variance[level, place].reshape(-1, 1)).T @ axes
+    if pattern:
+        light = np.maximum(seen, 0.0).reshape(*seen.shape[:2], -1)
+        both = np.einsum("lpmk,lpm->mk", onto, light) * (pattern / np.sqrt(BLOCK[0] * BLOCK[1]))
+        total += both.T @ both
     return total
 
 
@@ -238,6 +249,7 @@ def fit(
     start: Floats,
     error: Floats | None = None,
     near: Near | None = None,
+    held: int = 0,
 ) -> Fitted:
     """Return the most probable specimen for features (k,) of pictures that are means of so many exposures.
 
@@ -246,17 +258,20 @@ def fit(
     start : (5 + q,) where to begin.
     error : (k, k) covariance of the chain's own errors.
     near : what is known of these errors around the start.
+    held : how many of the unknowns, from the first on, stay at the start.
     """
     x, precision = inside(prior, start), prior.precision
     found: Fitted | None = None
     for _ in range(_MOST):
         seen, slopes = jacobian(chain, features, prior, x, near)
         gain = chain.gain(prior.values(x))
-        noise = covariance(chain, features, seen, gain, frames) + (0.0 if error is None else error)
+        noise = covariance(chain, features, seen, gain, frames, prior.pattern)
+        noise += 0.0 if error is None else error
         weighted = np.linalg.solve(noise, slopes.T)
         rest = observed - features(seen[None])[0]
         information = slopes @ weighted + precision
-        step = _step(prior, x, information, weighted.T @ rest - precision @ (x - prior.middle))
+        slope = weighted.T @ rest - precision @ (x - prior.middle)
+        step = _step(prior, x, information, slope, held)
         inverse = np.asarray(np.linalg.inv(information))
         found = Fitted(x, inverse, float(rest @ np.linalg.solve(noise, rest)), seen)
         size = np.abs(step) / np.sqrt(np.diag(inverse))
@@ -267,14 +282,14 @@ def fit(
     return found
 
 
-def _step(prior: Prior, x: Floats, information: Floats, slope: Floats) -> Floats:
+def _step(prior: Prior, x: Floats, information: Floats, slope: Floats, held: int) -> Floats:
     """Return the step of Gauss and Newton to the best place that lies within the prior's ranges.
 
     What is at the end of its range and wants to go on is held, and the others go where they are best then;
     the step ends where the next one comes to its end.
     """
     low, high = prior.ranges.T
-    free = np.ones(len(x), np.bool_)
+    free = np.arange(len(x)) >= held
     step = np.zeros(len(x))
     for _ in range(len(low) + 1):
         step[:] = 0.0

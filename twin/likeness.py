@@ -23,7 +23,8 @@ MISALIGNED_PERCENT = 1.7
 """Standard deviation of shift (of the picture's width), scale and turn of a camera that is still valid: so
 that one which is off by 1 % in all of them is not among the strangest."""
 _GAIN = 0.01  # standard deviation of the brightness
-_PATTERN = 1.8  # PRNU between two cameras, over that of one: of another one that has 1.5 times as much
+PATTERN = 1.8
+"""PRNU between two cameras, over that of one: of another one that has 1.5 times as much."""
 _BLANK = 0.15  # share without an inclusion
 _TOLERANCE = 0.005
 
@@ -96,7 +97,7 @@ def _scales(plain: Float, camera: Camera, block: int) -> dict[str, Float]:
     """Standard deviations that make features of tared pictures and references, (levels, rows, columns)."""
     mean = plain.mean(axis=0)
     pixel = _pixel_variance(mean, camera) / block**2
-    pattern = 0.01 * _PATTERN * camera.prnu_percent / block
+    pattern = 0.01 * PATTERN * camera.prnu_percent / block
     tared = np.sqrt(pixel * (1 + 1 / REFERENCE_FRAMES) + (pattern * camera.offset_dn) ** 2)
     reference = np.sqrt(pixel / REFERENCE_FRAMES + (pattern * mean) ** 2)
     return {"scale_tared": tared, "scale_reference": reference}
@@ -125,7 +126,7 @@ def _delivered(
     both[blank, :levels] = both[blank, levels:]
     both = novelty.misaligned(both, rng, MISALIGNED_PERCENT) - camera.offset_dn
     both *= np.exp(_GAIN * rng.standard_normal((count, 1, 1, 1)))
-    pattern = 0.01 * _PATTERN * camera.prnu_percent / block
+    pattern = 0.01 * PATTERN * camera.prnu_percent / block
     both *= 1.0 + pattern * rng.standard_normal((count, 1, *both.shape[2:]))
     both += camera.offset_dn
     # References of one exposure to many, cameras of half to twice the variance.

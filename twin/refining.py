@@ -33,7 +33,7 @@ error changes, without another."""
 _SHORT = 1e-3  # of the prior's spread: a way that tells nothing of how the error changes
 _REMAINS = 0.05  # of the map's error after its correction nearby (see `tests/test_refining.py`)
 _STRANGE = 1e-4  # chance of a misfit, below which the noise is taken to be louder than told
-_LOUDEST = 3.0  # times its variance that are believed
+_LOUDEST = 10.0  # times its variance that are believed
 _NODES = 9  # moduli at which all else is fitted
 _REACH = 3.5  # standard deviations that they go away from the most probable
 _STEPS = 2  # of Gauss and Newton at each, from its neighbour
@@ -181,7 +181,8 @@ def valley(
     first = int(np.argmin(np.abs(moduli - top)))
     rest = np.delete(np.arange(len(fitted.x)), _HELD)
     gain = chain.gain(prior.values(fitted.x))
-    noise = linalg.cho_factor(louder * covariance(chain, features, fitted.pictures, gain, frames) + error)
+    told = covariance(chain, features, fitted.pictures, gain, frames, prior.pattern)
+    noise = linalg.cho_factor(louder * told + error)
     slope = fitted.covariance[rest, _HELD] / fitted.covariance[_HELD, _HELD]
     found: dict[int, tuple[Floats, float, Floats]] = {}
     begin = fitted.x.copy()
