@@ -27,8 +27,9 @@ def truth(x: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def light_map(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The same, off by more than the noise, and by a little more from place to place."""
-    return truth(x) * 1.01 + 0.1 + 0.002 * np.asarray(x)[..., :1]
+    """The same, off by more than the noise, and by other amounts elsewhere, along the valley too."""
+    along = np.stack([np.cos(np.asarray(x)[..., 2] / 40.0 + n) for n in range(K)], axis=-1)
+    return truth(x) * 1.01 + 0.1 + 0.002 * np.asarray(x)[..., :1] + 0.05 * along
 
 
 class Features:
@@ -52,7 +53,8 @@ def simple(monkeypatch: pytest.MonkeyPatch) -> None:
 
     for module in (fitting, refining):
         monkeypatch.setattr(module, "covariance", covariance)
-    monkeypatch.setattr(fitting, "expected", expected)
+    for module in (fitting, refining):
+        monkeypatch.setattr(module, "expected", expected)
 
 
 CHAIN: Any = SimpleNamespace(gain=lambda values: 1.0)

@@ -10,7 +10,7 @@ marginals: Tierney and Kadane 1986, [tierney1986]).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,7 +20,7 @@ from scipy.interpolate import CubicSpline, interp1d
 
 from estimation.features import Features
 from twin.chain import Chain
-from twin.fitting import Fitted, Near, Prior, covariance, fit, inside, jacobian, placed
+from twin.fitting import Fitted, Near, Prior, covariance, expected, fit, inside, jacobian, placed
 
 Floats = NDArray[np.float64]
 Single = NDArray[np.float32]
@@ -38,6 +38,8 @@ _NODES = 9  # moduli at which all else is fitted
 _REACH = 3.5  # standard deviations that they go away from the most probable
 _STEPS = 2  # of Gauss and Newton at each, from its neighbour
 _FINE = 800  # moduli in between
+_ENDS = (0.1, 0.9)  # of the posterior
+_LONG = 0.12  # of the moduli's range: a valley along which the map's error changes
 _HELD = 2  # the modulus, among `PARAMETERS`
 
 
@@ -101,6 +103,16 @@ def refine(
     assert near is not None
     louder = found.chi_square / len(features.spread) if _strange(found, features) else 1.0
     followed = valley(chain, features, prior, observed, frames, found, remains, near, louder)
+    ends = followed.ends()
+    if ends[1][_HELD] - ends[0][_HELD] > _LONG * (prior.ranges[_HELD, 1] - prior.ranges[_HELD, 0]):
+        seen = []
+        for x in ends:
+            values = prior.values(x)
+            rest = placed(render(values)[None], [values])[0] - expected(chain, prior, [x])[0]
+            seen.append((x, np.asarray(rest, np.float32)))
+        near, renders = _bent(near, seen, prior), renders + 2
+        found = fit(chain, features, prior, observed, frames, found.x, remains, near)
+        followed = valley(chain, features, prior, observed, frames, found, remains, near, louder)
     return Refined(followed.draw(prior, samples, seed), found, near, bool(louder < _LOUDEST), renders)
 
 
@@ -112,14 +124,30 @@ def _corrected(near: Near | None, at: Floats, off: Single, prior: Prior) -> Near
     posterior all of a way along the valley would be laid to the little that it goes across.
     """
     if near is None:
-        return Near(at, off, np.zeros((0, len(at))), np.zeros((0, *off.shape), np.float32))
+        none = np.zeros((0, *off.shape), np.float32)
+        return Near(at, off, np.zeros((0, len(at))), none, none)
     way, metric = at - near.at, np.diag(prior.precision)
     length = float(way @ (metric * way))
+    # of the directions that are known already only their slope at the new place is kept
+    u = near.along @ way
+    shape = (-1, *(1,) * off.ndim)
+    slopes = near.slopes + np.float32(2.0) * u.reshape(shape).astype(np.float32) * near.bends
+    moved = replace(near, at=at, off=off, slopes=slopes)
     if length < _SHORT**2:
-        return replace(near, at=at, off=off)
-    slope = (off - near.of([at])[0])[None]
-    along = (metric * way / length)[None]
-    return Near(at, off, np.concatenate([near.along, along]), np.concatenate([near.slopes, slope]))
+        return moved
+    return moved.more(metric * way / length, np.asarray(off - near.of([at])[0], np.float32))
+
+
+def _bent(near: Near, ends: Sequence[tuple[Floats, Single]], prior: Prior) -> Near:
+    """Return what is known after renderings at both ends of the valley, unknowns and differences there: the
+    parabola through these and the middle."""
+    way, metric = ends[1][0] - ends[0][0], np.diag(prior.precision)
+    along = metric * way / float(way @ (metric * way))
+    u = np.array([along @ (x - near.at) for x, _ in ends])
+    rest = [off - near.of([x])[0] for x, off in ends]
+    slope, bend = np.linalg.solve(np.stack([u, u**2], axis=1), np.stack([one.ravel() for one in rest]))
+    shape = near.off.shape
+    return near.more(along, slope.reshape(shape).astype(np.float32), bend.reshape(shape).astype(np.float32))
 
 
 def _strange(found: Fitted, features: Features) -> bool:
@@ -135,27 +163,34 @@ class Valley:
     ----------
     modulus_kPa : (m,) rising.
     log_density : (m,) of the modulus.
-    middle : (m, 4) most probable size, depth and offsets at each.
-    spread : (m, 4, 4) their covariance at each.
+    points : (m, 5 + q) most probable unknowns at each.
+    spread : (m, 4, 4) covariance of size, depth and offsets at each.
     """
 
     modulus_kPa: Floats
     log_density: Floats
-    middle: Floats
+    points: Floats
     spread: Floats
 
     def draw(self, prior: Prior, count: int, seed: int) -> Floats:
         """Return samples (count, 5)."""
         rng = np.random.default_rng([seed, 11])
-        fine = np.linspace(self.modulus_kPa[0], self.modulus_kPa[-1], _FINE)
-        logs = CubicSpline(self.modulus_kPa, self.log_density)(fine)
-        shares = np.cumsum(np.exp(logs - logs.max()))
-        modulus = np.interp(rng.random(count), shares / shares[-1], fine)
-        others = CubicSpline(self.modulus_kPa, self.middle)(modulus)
+        modulus = self._quantile(rng.random(count))
+        others = CubicSpline(self.modulus_kPa, np.delete(self.points[:, :5], _HELD, axis=1))(modulus)
         roots = interp1d(self.modulus_kPa, np.linalg.cholesky(self.spread), axis=0)(modulus)
         others += np.einsum("nij,nj->ni", roots, rng.standard_normal(others.shape))
         drawn = np.insert(others, _HELD, modulus, axis=1)
         return np.clip(drawn, prior.ranges[:, 0], prior.ranges[:, 1])
+
+    def ends(self) -> Floats:
+        """Return unknowns (2, 5 + q) far down and up the valley."""
+        return np.asarray(CubicSpline(self.modulus_kPa, self.points)(self._quantile(np.array(_ENDS))))
+
+    def _quantile(self, shares: Floats) -> Floats:
+        fine = np.linspace(self.modulus_kPa[0], self.modulus_kPa[-1], _FINE)
+        logs = CubicSpline(self.modulus_kPa, self.log_density)(fine)
+        below = np.cumsum(np.exp(logs - logs.max()))
+        return np.asarray(np.interp(shares, below / below[-1], fine))
 
 
 def valley(
@@ -199,7 +234,7 @@ def valley(
     return Valley(
         moduli,
         np.array([one[1] for one in nodes]),
-        np.array([one[0][rest[:4]] for one in nodes]),
+        np.array([one[0] for one in nodes]),
         np.array([one[2][:4, :4] for one in nodes]),
     )
 
