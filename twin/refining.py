@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, stats
-from scipy.interpolate import CubicSpline, interp1d
+from scipy.interpolate import CubicSpline, PchipInterpolator, interp1d
 
 from estimation.features import Features
 from twin.chain import Chain
@@ -188,7 +188,7 @@ class Valley:
 
     def _quantile(self, shares: Floats) -> Floats:
         fine = np.linspace(self.modulus_kPa[0], self.modulus_kPa[-1], _FINE)
-        logs = CubicSpline(self.modulus_kPa, self.log_density)(fine)
+        logs = PchipInterpolator(self.modulus_kPa, self.log_density)(fine)  # never above its nodes
         below = np.cumsum(np.exp(logs - logs.max()))
         return np.asarray(np.interp(shares, below / below[-1], fine))
 
