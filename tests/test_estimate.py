@@ -160,11 +160,11 @@ def test_train_takes_its_arguments(monkeypatch, capsys):
     module = ModuleType("twin.train")
     module.train = lambda corpus, out, **options: called.update(corpus=corpus, out=out, **options) or "done"
     monkeypatch.setitem(sys.modules, "twin.train", module)
-    assert (
-        cli.main(["train", "c", "--out", "m", "--levels", "0", "2", "--minutes", "0.5", "--seed", "4"]) == 0
-    )
+    flags = ["--levels", "0", "2", "--minutes", "0.5", "--seed", "4", "--samples", "40", "--imagined", "500"]
+    assert cli.main(["train", "c", "--out", "m", *flags]) == 0
     del called["progress"]
-    assert called == {"corpus": "c", "out": "m", "levels": [0, 2], "minutes": 0.5, "seed": 4}
+    numbers = {"levels": [0, 2], "minutes": 0.5, "seed": 4, "samples": 40, "imagined": 500}
+    assert called == {"corpus": "c", "out": "m", **numbers}
     assert capsys.readouterr().out == "done\n"
     for wrong, word in (
         (["train", "c"], "--out"),
@@ -174,7 +174,7 @@ def test_train_takes_its_arguments(monkeypatch, capsys):
         assert word in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("verb", ["train", "estimate"])
+@pytest.mark.parametrize("verb", ["train", "assess", "estimate"])
 def test_help_has_examples(verb, capsys):
     assert cli.main([verb, "--help"]) == 0
     said = capsys.readouterr().out

@@ -23,7 +23,7 @@ def _train(arguments: argparse.Namespace) -> int:
         if value is not None and value < least:
             raise DesignError(flag, str(value), f"an integer >= {least}")
     from twin.reporting import Reporter
-    from twin.train import IMAGINED, train
+    from twin.train import train
 
     with Reporter() as report:
         written = train(
@@ -32,7 +32,7 @@ def _train(arguments: argparse.Namespace) -> int:
             levels=levels,
             minutes=arguments.minutes,
             samples=arguments.samples,
-            imagined=arguments.imagined or IMAGINED,
+            imagined=arguments.imagined,
             seed=arguments.seed,
             progress=report,
         )

@@ -92,7 +92,7 @@ def train(
     levels: Sequence[int] | None = None,
     minutes: float = 20.0,
     seed: int = 0,
-    imagined: int = IMAGINED,
+    imagined: int | None = None,
     samples: int | None = None,
     workers: int | None = None,
     progress: Progress | None = None,
@@ -103,7 +103,7 @@ def train(
     ----------
     levels : press levels to use, by number; all by default.
     minutes : the longest that the network is trained.
-    imagined : specimens that it is trained on, 100 or more.
+    imagined : specimens that it is trained on, 100 or more; by default `IMAGINED`.
     samples : of the corpus that the light map is learned from, at most; all by default.
 
     Raises
@@ -111,7 +111,7 @@ def train(
     DesignError
         In one line, for a corpus that cannot teach this.
     """
-    tell = progress or (lambda stage, share: None)
+    tell, imagined = progress or (lambda stage, share: None), imagined or IMAGINED
     source, place = Corpus(corpus), Path(f"{out}.safetensors")
     parts = place.with_name(place.name.removesuffix(".safetensors") + ".parts")
     plan = source.plan
