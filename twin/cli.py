@@ -61,7 +61,7 @@ _FLAGS = {
 
 
 # Verbs that go on, when they are called again, where they were cut off.
-_RESUMED = ("corpus", "emulate", "explore", "replicate", "train")
+_RESUMED = ("assess", "corpus", "emulate", "explore", "replicate", "train")
 
 # Rooms whose own errors are one line for the user.
 _ROOMS = ("fem.", "scenes.", "estimation.", "twin.")
