@@ -9,7 +9,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -19,9 +18,9 @@ from pathlib import Path
 from twin import explore, layout_fields
 from twin.evaluate import Bench, evaluate
 from twin.explore import Exploration
+from twin.pooled import end_with
 
 _POLL_S = 0.5
-_ORPHAN_S = 1.0
 _STOP_S = 10.0
 
 
@@ -199,13 +198,7 @@ def main(arguments: list[str]) -> int:
     """Explore in a folder until all layouts are there; ends with the process that started it."""
     folder, parent = Path(arguments[0]), int(arguments[1])
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent hears Ctrl-C, and says so
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(_ORPHAN_S)
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
+    end_with(parent)
     _one_thread()
     explore.work(explore.reopened(folder))
     return 0

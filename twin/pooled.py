@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 Task = TypeVar("Task")
 
-_ORPHAN_S = 2.0
+_ORPHAN_S = 1.0
 
 
 def each(
@@ -43,11 +43,17 @@ def each(
             raise
 
 
-def _begin(parent: int, begin: Callable[[], None]) -> None:
+def end_with(parent: int) -> None:
+    """End this process soon after the one that began it has gone, however that went."""
+
     def watch() -> None:
         while os.getppid() == parent:
             time.sleep(_ORPHAN_S)
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
+
+
+def _begin(parent: int, begin: Callable[[], None]) -> None:
+    end_with(parent)
     begin()
