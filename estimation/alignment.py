@@ -42,3 +42,11 @@ def taken_from(pictures: ArrayLike, matrix: Floats) -> Floats:
             for one in np.asarray(pictures, np.float64)
         ]
     )
+
+
+def covered(shape: tuple[int, int], matrix: Floats) -> NDArray[np.bool_]:
+    """Return which places (rows, columns) a matrix (3, 3) leads to within a picture of this shape."""
+    rows, columns = shape
+    here = np.stack([*np.mgrid[:rows, :columns], np.ones(shape)])
+    row, column, _ = np.tensordot(matrix, here, 1)
+    return np.asarray((row >= 0) & (row <= rows - 1) & (column >= 0) & (column <= columns - 1))

@@ -7,7 +7,7 @@ that components are ordered by what can be seen.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +47,11 @@ class Features:
         given = np.asarray(pictures, np.float32)
         tared = np.stack([given[:, :, 0] - given[:, :, 1], given[:, :, 1]], axis=2)
         return np.asarray((tared / self.noise[:, :, None, None]).reshape(len(given), -1), np.float32)
+
+    def only(self, blocks: NDArray[np.bool_]) -> Features:
+        """Return the features that look at some blocks (r, c) of each picture alone."""
+        seen = np.broadcast_to(blocks, self.shape).reshape(-1)
+        return replace(self, axes=self.axes * seen.astype(np.float32))
 
     @property
     def onto(self) -> Single:

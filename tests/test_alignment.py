@@ -8,9 +8,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from estimation.alignment import moved
+from estimation.alignment import covered, moved, placement
 from twin import fitting
+from twin.chain import BLOCK
 from twin.fitting import ALIGNMENT, Prior
+from twin.put_back import put_back, where
+from twin.received import Received
+from twin.retake import average
 
 RANGES = np.array([[2.0, 13.0], [4.0, 12.0], [40.0, 120.0], [-2.0, 2.0], [-2.0, 2.0]])
 ROWS, COLUMNS = 24, 40
@@ -33,32 +37,49 @@ def test_a_ramp_is_shifted_turned_and_magnified() -> None:
     assert turned[1] == pytest.approx((np.cos(0.1) * y + np.sin(0.1) * x)[inner], abs=1e-5)
 
 
-def blob(values: Mapping[str, float]) -> NDArray[np.float64]:
+def blob(
+    values: Mapping[str, float], x: NDArray[np.floating] = X, y: NDArray[np.floating] = Y
+) -> NDArray[np.float64]:
     """(1, 2, rows, columns): an inclusion's light over the pattern that four LEDs leave."""
-    x, y = X - 19.5 - 4.0 * values["offset_x_mm"], Y - 11.5 - 4.0 * values["offset_y_mm"]
-    light = values["size_mm"] * np.exp(-(x**2 + y**2) / (2.0 * values["depth_mm"] ** 2))
-    lamps = 30.0 + 5.0 * np.cos(0.3 * X) * np.cos(0.25 * Y) + 0.2 * X
+    aside, up = x - 19.5 - 4.0 * values["offset_x_mm"], y - 11.5 - 4.0 * values["offset_y_mm"]
+    light = values["size_mm"] * np.exp(-(aside**2 + up**2) / (2.0 * values["depth_mm"] ** 2))
+    lamps = 30.0 + 5.0 * np.cos(0.3 * x) * np.cos(0.25 * y) + 0.2 * x
     return np.stack([lamps + light * (1.0 + 0.002 * values["modulus_kPa"]), lamps])[None]
 
 
-def test_where_the_camera_stands_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The fit that knows of it finds shift, scale, turn and inclusion; the fit that does not is far off."""
-    prior = Prior(RANGES, (), np.zeros(0), np.zeros((0, 0)))
+TRUTH = {"size_mm": 8.0, "depth_mm": 6.0, "modulus_kPa": 80.0, "offset_x_mm": 0.5, "offset_y_mm": -0.3}
+OFF = (0.012, -0.008, 0.015, 0.02)
+
+
+class Features:
+    """Pictures are features."""
+
+    spread = np.ones(2 * ROWS * COLUMNS)
+
+    def __init__(self, blocks: NDArray[np.bool_] | None = None) -> None:
+        self.blocks = np.ones((ROWS, COLUMNS), np.bool_) if blocks is None else blocks
+
+    def __call__(self, pictures: NDArray[Any]) -> NDArray[Any]:
+        return np.asarray(pictures * self.blocks).reshape(len(pictures), -1)
+
+    def only(self, blocks: NDArray[np.bool_]) -> "Features":
+        return Features(blocks)
+
+
+@pytest.fixture
+def chain(monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.setattr(fitting, "_inputs", lambda c, p, many: (np.zeros(0), [p.values(x) for x in many]))
     monkeypatch.setattr(fitting, "pictures", lambda c, i, values: np.float32([blob(one) for one in values]))
     monkeypatch.setattr(fitting, "Brightness", SimpleNamespace(of=lambda chain, values: values))
     monkeypatch.setattr(fitting, "covariance", lambda *a: np.eye(2 * ROWS * COLUMNS) * 0.05**2)
-    chain: Any = SimpleNamespace(gain=lambda values: 1.0)
+    return SimpleNamespace(gain=lambda values: 1.0)
 
-    class Features:
-        spread = np.ones(2 * ROWS * COLUMNS)
 
-        def __call__(self, pictures: NDArray[Any]) -> NDArray[Any]:
-            return np.asarray(pictures).reshape(len(pictures), -1)
-
+def test_where_the_camera_stands_is_found(chain: Any) -> None:
+    """The fit that knows of it finds shift, scale, turn and inclusion; the fit that does not is far off."""
+    prior = Prior(RANGES, (), np.zeros(0), np.zeros((0, 0)))
     features: Any = Features()
-    truth = {"size_mm": 8.0, "depth_mm": 6.0, "modulus_kPa": 80.0, "offset_x_mm": 0.5, "offset_y_mm": -0.3}
-    off = (0.012, -0.008, 0.015, 0.02)
+    truth, off = TRUTH, OFF
     pixels = moved(blob(truth)[0], *off)
     told = pixels.ravel() + 0.05 * np.random.default_rng(0).standard_normal(pixels.size)
     start = np.array([7.0, 7.0, 80.0, 0.0, 0.0])
@@ -70,3 +91,36 @@ def test_where_the_camera_stands_is_found(monkeypatch: pytest.MonkeyPatch) -> No
     values = wide.values(found.x)
     assert [values[name] for name in ALIGNMENT] == pytest.approx(off, abs=1e-3)
     assert values["offset_x_mm"] == pytest.approx(0.5, abs=0.02) and abs(values["depth_mm"] - 6.0) < 0.05
+
+
+def test_pixels_are_put_back(chain: Any) -> None:
+    """Found to a tenth of a pixel, wherever the inclusion lies, and told which blocks were seen.
+
+    Coarse pictures, which blur the light, are a first step only.
+    """
+    prior = Prior(RANGES, (), np.zeros(0), np.zeros((0, 0))).of_another_camera(0.0, 2.0)
+    high, wide = BLOCK
+    shape = (high * ROWS, wide * COLUMNS)
+    y, x = np.mgrid[0 : shape[0], 0 : shape[1]]
+    fine = blob(TRUTH, (x - (wide - 1) / 2) / wide, (y - (high - 1) / 2) / high)[0]
+    pictures = moved(fine, *OFF).astype(np.float32)
+    received = Received(pictures[:1], pictures[1:], 1, 16, 8, ("a",))
+
+    def coarse(now: Received) -> NDArray[np.float32]:
+        return np.stack([average(now.images[0], BLOCK), average(now.references[0], BLOCK)])[None]
+
+    features: Any = Features()
+    start = np.array([8.0, 6.0, 80.0, 0.3, -0.1])
+    matrix = where(chain, features, np.zeros(1), coarse, prior, received, start)
+    corners = np.array([[0, 0, 1], [shape[0] - 1, shape[1] - 1, 1], [0, shape[1] - 1, 1]]).T
+    true = np.linalg.inv(placement(shape, *OFF))
+    assert np.abs((matrix - true) @ corners).max() < 0.1
+    now, blocks = put_back(received, matrix)
+    rest = np.abs(coarse(now)[0] - [average(one.astype(np.float32), BLOCK) for one in fine])
+    assert rest[:, blocks].max() < 0.02 < 0.2 < np.abs(rest[:, ~blocks]).max()
+
+
+def test_what_a_camera_has_seen() -> None:
+    assert covered((3, 4), np.eye(3)).all()
+    seen = covered((10, 20), placement((10, 20), 0.1, 0.0, 0.0, 0.0))  # two columns to the right
+    assert seen[:, :18].all() and not seen[:, 18:].any()

@@ -10,7 +10,7 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,7 @@ from twin.design import parse_design
 from twin.estimates import NAMES, Estimate
 from twin.fitting import Fitted, Near, Prior, fit, limits
 from twin.imagined import mean_variance
-from twin.put_back import put_back
+from twin.put_back import put_back, where
 from twin.received import Received
 from twin.refining import Refined, refine
 from twin.rendered import rendered as render
@@ -103,12 +103,9 @@ class Estimator:
             start = drawn.mean(axis=0)
             refined = self.refined(told[0], frames, start, samples=samples, seed=seed)
             if refined is None or not refined.explains:
-                parts = (self.chain, self.features, self.error, self.coarse)
-                seen = put_back(*parts, self.prior.of_another_camera(self._pattern), received, start)
-                told = self.features(seen[None])
-                prior = self.prior.of_another_camera(self._pattern, _LEFT_PERCENT)
-                again = self.refined(told[0], frames, start, samples=samples, seed=seed, prior=prior)
-                refined = again or refined
+                again, back = self._put_back(received, frames, start, samples, seed)
+                if again is not None:
+                    refined, seen = again, back
         fitted = self.fitted(told[0], frames, drawn.mean(axis=0)) if refined is None else refined.fitted
         trusted = refined is not None and refined.explains
         wanted = (refined.samples if refined is not None and trusted else drawn)[:, : len(NAMES)]
@@ -162,6 +159,20 @@ class Estimator:
             )
         except (fem.NotModelled, NotModelled):
             return None
+
+    def _put_back(
+        self, received: Received, frames: float, start: NDArray[np.floating], samples: int, seed: int
+    ) -> tuple[Refined | None, Single]:
+        """Return what `refined` does of pictures of a camera that stands a little off, and these pictures put
+        back; blocks that it has not seen are those that are expected."""
+        parts = (self.chain, self.features, self.error, self.coarse)
+        matrix = where(*parts, self.prior.of_another_camera(self._pattern), received, start)
+        now, blocks = put_back(received, matrix)
+        left = self.prior.of_another_camera(self._pattern, _LEFT_PERCENT)
+        placed = replace(self, features=self.features.only(blocks), prior=left)
+        back = self.coarse(now)
+        found = placed.refined(placed.features(back[None])[0], frames, start, samples=samples, seed=seed)
+        return found, back if found is None else np.where(blocks, back, found.fitted.pictures)
 
     @property
     def _pattern(self) -> float:

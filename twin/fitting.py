@@ -173,7 +173,7 @@ def expected_layers(chain: Chain, prior: Prior, many: Sequence[Floats]) -> NDArr
 
 def _inputs(chain: Chain, prior: Prior, many: Sequence[Floats]) -> tuple[Floats, list[dict[str, float]]]:
     """The light map's inputs (n, levels, 2, k) and the values by name; equal contacts are computed once."""
-    values = [_reachable(chain, prior.values(x)) for x in many]
+    values = [reachable(chain, prior.values(x)) for x in many]
     contact = [tuple(v for k, v in one.items() if not _bright(k)) for one in values]
     first: dict[tuple[float, ...], int] = {}
     for key in contact:
@@ -182,7 +182,7 @@ def _inputs(chain: Chain, prior: Prior, many: Sequence[Floats]) -> tuple[Floats,
     return chain.inputs(chosen)[[first[key] for key in contact]], values
 
 
-def _reachable(chain: Chain, values: dict[str, float]) -> dict[str, float]:
+def reachable(chain: Chain, values: dict[str, float]) -> dict[str, float]:
     """Values within the emulator's ranges: strange pictures may ask for a press that it cannot tell."""
     ranges, tissue = chain.emulator.plan.ranges, chain.design.specimen
     spans = {"specimen.thickness_mm": ranges.thickness_mm, "specimen.modulus_kPa": ranges.tissue_kPa}

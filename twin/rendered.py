@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 import fem
 from scenes.traced import TracedLight
-from twin import presses
-from twin.chain import Chain, coarse_charges, seen_by
+from twin import presses, retake
+from twin.chain import BLOCK, Chain, seen_by, whole_blocks
 from twin.study import PARAMETERS
 
 Single = NDArray[np.float32]
@@ -39,8 +39,8 @@ def rendered(
     inclusion = fem.Inclusion(size, depth, modulus, (x, y))
     presses.check_emulated(design, inclusion, depths, chain.emulator)
     renderer = SpectralRenderer(design.sensor(), count=design.light.bands, at=design.sensor, device="cpu")
-    flux = np.array([led.flux_W for led in design.leds], np.float32)
-    scale = chain.fluxes(values) / flux / np.float32(chain.gain(values))
+    flux = np.array([led.flux_W for led in design.leds])
+    weights = chain.fluxes(values) / flux / chain.gain(values)
     found = []
     for press in presses.emulated(design, inclusion, depths, chain.emulator):
         pair = []
@@ -48,6 +48,7 @@ def rendered(
             layers = renderer.render(
                 press.surface, field=field, quality="preview", traced=tuple(traced)
             ).radiance
-            pair.append(np.tensordot(scale, coarse_charges(design, layers), 1))
-        found.append(np.stack(pair))
-    return np.asarray(np.stack(found), np.float32)
+            pixels = retake.charge(design, layers, weights, (1, 1))
+            pair.append(retake.average(whole_blocks(pixels), BLOCK))
+        found.append(pair)
+    return np.asarray(found, np.float32)
