@@ -80,7 +80,7 @@ def card_of(design: Design, levels: tuple[float, ...]) -> dict[str, Any]:
 
 
 def as_module(estimator: StandIn) -> ModuleType:
-    """A module that stands for `twin.estimator` and knows this one estimator only."""
-    module = ModuleType("twin.estimator")
+    """A module that stands for `twin.estimator_file` and knows this one estimator only."""
+    module = ModuleType("twin.estimator_file")
     module.load_estimator = lambda path: estimator  # type: ignore[attr-defined]
     return module

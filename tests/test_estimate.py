@@ -32,7 +32,7 @@ def use(monkeypatch):
 
     def put(**options):
         estimator = StandIn(card_of(SENSOR, LEVELS), **options)
-        monkeypatch.setitem(sys.modules, "twin.estimator", as_module(estimator))
+        monkeypatch.setitem(sys.modules, "twin.estimator_file", as_module(estimator))
         return estimator
 
     return put

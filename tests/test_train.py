@@ -10,7 +10,8 @@ from corpora import freeze_tiny, make_up_emulator
 import twin
 from twin import index, sample, store
 from twin.complaint import DesignError
-from twin.estimator import Estimator, load_estimator
+from twin.estimator import Estimator
+from twin.estimator_file import load_estimator
 from twin.plan import load_plan
 from twin.received import Received
 from twin.train import train

@@ -26,7 +26,8 @@ from twin.assessment import METHODS, SHORT, answered, record_of
 from twin.complaint import DesignError, shown
 from twin.corpus import Corpus
 from twin.estimates import NAMES
-from twin.estimator import Estimator, load_estimator
+from twin.estimator import Estimator
+from twin.estimator_file import load_estimator
 from twin.pooled import each
 from twin.report import write_json
 from twin.train import TEST, level_names
@@ -71,7 +72,7 @@ def assess(
         In one line.
     """
     source, estimator = Corpus(corpus), load_estimator(model)
-    _levels(source, estimator)
+    levels_of(source, estimator)
     numbers = [int(n) for n in source.samples if source.plan.group(int(n)) == TEST]
     numbers = (numbers or [int(n) for n in source.samples])[:samples]
     folder = Path(out)
@@ -104,7 +105,7 @@ def assess(
     return record
 
 
-def _levels(source: Corpus, estimator: Estimator) -> list[int]:
+def levels_of(source: Corpus, estimator: Estimator) -> list[int]:
     """Numbers of the corpus's press levels that the model wants; raises `DesignError` for other sensors."""
     design, card = source.design, estimator.card
     names = ("pixels", "LEDs")
@@ -155,7 +156,7 @@ def answer(task: Task) -> None:
     """Answer one sample and write its record; runs in a worker process."""
     estimator, source = _loaded(task.model), _opened(task.corpus)
     plan = source.plan
-    levels = _levels(source, estimator)
+    levels = levels_of(source, estimator)
     values = level_names({k: v for k, v in plan.parameters(task.sample).items() if v is not None}, levels)
     blank = plan.inclusion(task.sample) is None
     row: dict[str, Any] = {

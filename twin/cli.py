@@ -61,7 +61,7 @@ _FLAGS = {
 
 
 # Verbs that go on, when they are called again, where they were cut off.
-_RESUMED = ("assess", "corpus", "emulate", "explore", "replicate", "train")
+_RESUMED = ("assess", "calibrate", "corpus", "emulate", "explore", "replicate", "train")
 
 # Rooms whose own errors are one line for the user.
 _ROOMS = ("fem.", "scenes.", "estimation.", "twin.")
@@ -132,7 +132,7 @@ def _run(arguments: argparse.Namespace) -> int:
         from twin import study_cli
 
         return study_cli.run(arguments)
-    elif arguments.verb in ("train", "assess", "estimate"):
+    elif arguments.verb in ("train", "calibrate", "assess", "estimate"):
         from twin import estimate_cli
 
         return estimate_cli.run(arguments)

@@ -74,7 +74,7 @@ def estimate(
 
     Parameters
     ----------
-    model : file of a trained estimator, see `twin.estimator.load_estimator`.
+    model : file of a trained estimator, see `twin.estimator_file.load_estimator`.
     frames, references, exposures, flip : as of `twin.receiving.receive`.
     out : folder to make for `RECORD` and `PICTURE`; None for none.
     samples, seed : of the posterior.
@@ -104,7 +104,7 @@ def _estimate(
     rendered: bool,
     progress: Callable[[str, float], None],
 ) -> Found:
-    from twin.estimator import load_estimator
+    from twin.estimator_file import load_estimator
 
     progress("model", 0.0)
     estimator = load_estimator(model)

@@ -1,4 +1,4 @@
-"""What the verbs of learned estimators accept: ``twin train``, ``assess`` and ``estimate``."""
+"""What the verbs of learned estimators accept: ``twin train``, ``calibrate``, ``assess`` and ``estimate``."""
 
 from __future__ import annotations
 
@@ -28,6 +28,21 @@ examples:
   twin assess models/tsis corpora/pictures --out assessed
   twin assess models/tsis corpora/pictures --quick --out quick
   twin assess models/tsis corpora/solved --samples 20 --out mismatch
+  twin assess models/tsis corpora/pictures --curve --out curve
+"""
+
+_CALIBRATE = """\
+Teach a model what a corpus of known inclusions is beyond its own emulator, learned light and coarse meshes:
+full solves with light of their own, of the sensor that the model was trained for. The corpus varies what the
+model's own did; two dozen inclusions all over the ranges will do. What is not foretold after that goes into
+the intervals, and pictures of that kind are no longer refused as unlike the model's. Ten seconds a sample and
+core, kept in MODEL.parts: the same command goes on, also after Ctrl-C. No inclusion that the model is to be
+tested on may be in the corpus.
+
+examples:
+  twin corpus plan my-solves.toml --mechanics finite --light standard --out corpora/solved
+  twin corpus run corpora/solved
+  twin calibrate models/tsis corpora/solved --out models/tsis-solved
 """
 
 _ESTIMATE = """\
@@ -78,10 +93,24 @@ def add(verbs: Any) -> None:
     assess.add_argument("corpus", metavar="CORPUS", help="folder of a finished corpus")
     assess.add_argument("--out", metavar="DIR", help="folder for the assessment")
     assess.add_argument("--samples", type=whole, metavar="N", help="at most so many (default: all)")
+    assess.add_argument(
+        "--curve",
+        action="store_true",
+        help="instead: how well light learned from 40, 80, ... of the corpus's samples does",
+    )
     assess.add_argument("--quick", action="store_true", help="the network alone, without rendering")
     assess.add_argument("--workers", type=whole, metavar="N", help="processes (default: one for each core)")
     assess.add_argument(
         "--seed", type=whole, default=0, metavar="N", help="of all random numbers (default 0)"
+    )
+
+    calibrate = add_verb(verbs, "calibrate", "teach a model what known inclusions are beyond it", _CALIBRATE)
+    calibrate.add_argument("model", metavar="MODEL", help="what twin train wrote, FILE.safetensors")
+    calibrate.add_argument("corpus", metavar="CORPUS", help="folder of a finished corpus")
+    calibrate.add_argument("--out", metavar="MODEL", help="model to write, without its ending")
+    calibrate.add_argument("--samples", type=whole, metavar="N", help="the first so many (default: all)")
+    calibrate.add_argument(
+        "--workers", type=whole, metavar="N", help="processes (default: one for each core)"
     )
 
     estimate = add_verb(verbs, "estimate", "an inclusion from pictures, with how sure that is", _ESTIMATE)

@@ -1,4 +1,4 @@
-"""What ``twin train`` and ``twin estimate`` do."""
+"""What ``twin train``, ``calibrate``, ``assess`` and ``estimate`` do."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from twin.complaint import DesignError, shown
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the verb of a parsed command line and return the exit status."""
-    return {"train": _train, "assess": _assess, "estimate": _estimate}[arguments.verb](arguments)
+    verbs = {"train": _train, "calibrate": _calibrate, "assess": _assess, "estimate": _estimate}
+    return verbs[arguments.verb](arguments)
 
 
 def _train(arguments: argparse.Namespace) -> int:
@@ -40,15 +41,43 @@ def _train(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _calibrate(arguments: argparse.Namespace) -> int:
+    if arguments.out is None:
+        raise DesignError("--out", "nothing", "the model to write, such as models/tsis-solved")
+    for flag, value in (("--samples", arguments.samples), ("--workers", arguments.workers)):
+        if value == 0:
+            raise DesignError(flag, "0", "an integer >= 1")
+    from twin.calibrate import calibrate
+    from twin.reporting import Reporter
+
+    with Reporter() as report:
+        written = calibrate(
+            arguments.model,
+            arguments.corpus,
+            arguments.out.removesuffix(".safetensors"),
+            samples=arguments.samples,
+            workers=arguments.workers,
+            progress=report,
+        )
+    print(written)
+    return 0
+
+
 def _assess(arguments: argparse.Namespace) -> int:
     if arguments.out is None:
         raise DesignError("--out", "nothing", "a folder for the assessment")
     for flag, value in (("--samples", arguments.samples), ("--workers", arguments.workers)):
         if value == 0:
             raise DesignError(flag, "0", "an integer >= 1")
-    from twin import assessing, assessment
+    from twin import assessing, assessment, learning_curve
     from twin.reporting import Reporter
 
+    if arguments.curve:
+        with Reporter() as report:
+            told = learning_curve.curve(arguments.model, arguments.corpus, arguments.out, progress=report)
+        print(learning_curve.words(told))
+        print(f"look at: {Path(arguments.out) / learning_curve.PICTURE}")
+        return 0
     with Reporter() as report:
         record = assessing.assess(
             arguments.model,

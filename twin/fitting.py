@@ -350,16 +350,23 @@ def inside(prior: Prior, x: Floats) -> Floats:
 
 
 def limits(
-    chain: Chain, features: Features, prior: Prior, values: Mapping[str, float], frames: float
+    chain: Chain,
+    features: Features,
+    prior: Prior,
+    values: Mapping[str, float],
+    frames: float,
+    error: Floats | float = 0.0,
 ) -> tuple[Floats, float]:
     """Return the prior-included bound (5 + q, 5 + q) at true values, (J C⁻¹ Jᵀ + P)⁻¹, and the deflection d'
     with which an ideal observer tells the inclusion from none (see `estimation.detection`).
+
+    ``error`` is the covariance (k, k) of what pictures are off by, besides noise.
 
     Raises `fem.NotModelled` where the chain cannot go.
     """
     x = prior.unknowns(values)
     seen, slopes = jacobian(chain, features, prior, x)
-    noise = covariance(chain, features, seen, chain.gain(prior.values(x)), frames)
+    noise = covariance(chain, features, seen, chain.gain(prior.values(x)), frames) + error
     told = slopes @ np.linalg.solve(noise, slopes.T)
     without = np.stack([seen[:, 1], seen[:, 1]], axis=1)
     signal = (features(seen[None])[0] - features(without[None])[0]).astype(np.float64)

@@ -77,6 +77,7 @@ def refine(
     samples: int = 4000,
     seed: int = 0,
     begin: Near | None = None,
+    always: Floats | float = 0.0,
 ) -> Refined:
     """Return the posterior for features (k,) of pictures that are means of so many exposures.
 
@@ -86,10 +87,12 @@ def refine(
     start : (5 + q,) where the fit begins.
     render : expected pictures (levels, 2, r, c) of a specimen's values, by light transport.
     begin : what is known of the light map's errors near the start, from pictures of the same specimen.
+    always : (k, k) covariance of what rendered pictures are off by.
     """
     near = begin
-    remains = _REMAINS**2 * error
-    found = fit(chain, features, prior, observed, frames, start, error if near is None else remains, near)
+    remains = _REMAINS**2 * error + always
+    first = error + always if near is None else remains
+    found = fit(chain, features, prior, observed, frames, start, first, near)
     for renders in range(1, _RENDERS + 1):  # noqa: B007
         at = found.x
         values = prior.values(at)

@@ -33,7 +33,8 @@ from twin.chain import BLOCK, Chain, coarse_charges, contacts
 from twin.complaint import DesignError, shown
 from twin.corpus import Corpus
 from twin.design import Design
-from twin.estimator import Estimator, black, save_estimator, without_luminaires
+from twin.estimator import Estimator, black
+from twin.estimator_file import save_estimator, without_luminaires
 from twin.fields import tables_of
 from twin.fitting import prior_of
 from twin.frame import versions
@@ -58,7 +59,7 @@ IMAGINED = 16_000
 _LEAST = 30  # samples that a light map is learned from
 _SHOWN = 2500  # specimens that features are found from
 _STEPS = 12_000
-_LIKE = 600  # specimens that likeness is learned from
+LIKE = 600  # specimens that likeness is learned from
 REFUSE_BELOW = 0.005
 
 
@@ -115,7 +116,7 @@ def train(
     source, place = Corpus(corpus), Path(f"{out}.safetensors")
     parts = place.with_name(place.name.removesuffix(".safetensors") + ".parts")
     plan = source.plan
-    design = _of_levels(source, levels)
+    design = of_levels(source, levels)
     many = specimens(plan, imagined, seed)
     if plan.emulator is None:
         raise DesignError("mechanics", shown(plan.mechanics), '"emulator"', source=source.name)
@@ -179,7 +180,7 @@ def train(
         network,
         prior_of(ranges, many),
         np.asarray(error.T @ error / max(len(error), 1), np.float64),
-        likeness_of(chain, inputs[:_LIKE], many[:_LIKE], errors, seed),
+        likeness_of(chain, inputs[:LIKE], many[:LIKE], errors, seed),
         () if plan.traced is None else traced.load(plan.traced),
     )
     metrics: dict[str, Any] = {}
@@ -188,11 +189,11 @@ def train(
             estimator, source, testing, chosen, seed, lambda s: tell("test", 0.9 + 0.1 * s)
         )
     estimator = replace(estimator, card={**estimator.card, "metrics": metrics})
-    save_estimator(estimator, plan.emulator, place)
+    save_estimator(estimator, plan.emulator.read_bytes(), place)
     return assess.words(metrics, str(place))
 
 
-def _of_levels(source: Corpus, levels: Sequence[int] | None) -> Design:
+def of_levels(source: Corpus, levels: Sequence[int] | None) -> Design:
     design = source.plan.base
     if design.camera.colour != "mono":
         raise DesignError("camera.colour", shown(design.camera.colour), '"mono"', source=source.name)

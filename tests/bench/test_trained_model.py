@@ -1,0 +1,115 @@
+"""A trained model before strange pictures and another camera. Give a model and its corpus:
+
+TWIN_MODEL=models/tsis TWIN_CORPUS=corpora/pictures pytest -m slow -s tests/bench/test_trained_model.py
+"""
+
+import os
+from collections import Counter
+
+import numpy as np
+import pytest
+from aliens import aliens
+from numpy.typing import NDArray
+from other_camera import real_camera
+
+import twin
+from twin import likeness
+from twin.complaint import DesignError
+from twin.estimates import NAMES
+from twin.estimator import Estimator, black
+from twin.estimator_file import load_estimator
+from twin.received import Received
+from twin.sound import check_exposure, check_pair
+from twin.train import TEST
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif("TWIN_MODEL" not in os.environ, reason="needs TWIN_MODEL and TWIN_CORPUS"),
+]
+VALID, ANSWERED = 200, int(os.environ.get("TWIN_SAMPLES", "12"))
+
+
+@pytest.fixture(scope="module")
+def estimator() -> Estimator:
+    return load_estimator(os.environ["TWIN_MODEL"])
+
+
+@pytest.fixture(scope="module")
+def corpus() -> twin.Corpus:
+    return twin.Corpus(os.environ["TWIN_CORPUS"])
+
+
+def held_out(corpus: twin.Corpus) -> list[int]:
+    return [int(n) for n in corpus.samples if corpus.plan.group(int(n)) == TEST]
+
+
+def own(corpus: twin.Corpus, number: int) -> Received:
+    levels = range(corpus.levels)
+    images = np.stack([corpus.image(number, level) for level in levels]).astype(np.float32)
+    references = np.stack([corpus.reference(number, level) for level in levels]).astype(np.float32)
+    names = tuple(f"{number}/{level}" for level in levels)
+    return Received(images, references, 1, 16, corpus.design.camera.bits, names)
+
+
+def another(corpus: twin.Corpus, number: int) -> Received:
+    """The same light through a camera with other noise that stands 1 % off in all ways."""
+    levels = range(corpus.levels)
+    lit = np.stack([corpus.radiance(number, level).sum(0) for level in levels])
+    plain = np.stack([corpus.reference_radiance(number, level).sum(0) for level in levels])
+    return real_camera(corpus.design_of(number), lit, plain, number)
+
+
+def truth(corpus: twin.Corpus, number: int) -> NDArray[np.float64] | None:
+    inclusion = corpus.plan.inclusion(number)
+    return None if inclusion is None else np.array([corpus.plan.parameters(number)[name] for name in NAMES])
+
+
+def refused(estimator: Estimator, received: Received) -> bool:
+    """Whether `twin estimate` refuses pictures: for themselves, or as unlike this sensor's."""
+    try:
+        for stack in (received.images, received.references):
+            for picture in stack:
+                check_exposure(picture, received.bits, "picture")
+        check_pair(received)
+    except DesignError:
+        return True
+    seen = estimator.coarse(received) + black(estimator.chain)
+    like, _ = likeness.likeness(estimator.novelty, seen[:, 0], seen[:, 1])
+    return bool(like < estimator.card["refuse_below"])
+
+
+def test_valid_pictures_are_taken_and_others_refused(estimator: Estimator, corpus: twin.Corpus) -> None:
+    numbers = held_out(corpus)[:VALID]
+    valid = [refused(estimator, own(corpus, number)) for number in numbers]
+    moved = [refused(estimator, another(corpus, number)) for number in numbers[::4]]
+    large = next(n for n in numbers if (size := truth(corpus, n)) is not None and size[0] > 7.0)
+    strange = aliens(own(corpus, large))
+    found = Counter(one.family for one in strange if refused(estimator, one.received))
+    print(
+        f"\nrefused: {sum(valid)} of {len(valid)} valid, {sum(moved)} of {len(moved)} of another camera, "
+        f"{found.total()} of {len(strange)} strange ones: {dict(found)}"
+    )
+    assert sum(valid) <= 0.02 * len(valid) and sum(moved) <= 0.02 * len(moved)
+    assert found.total() >= 0.95 * len(strange)
+
+
+def test_another_camera_that_stands_off_is_within_twice_the_error(
+    estimator: Estimator, corpus: twin.Corpus
+) -> None:
+    """On the same inclusions; half a minute each for its own camera, a minute for the other."""
+    off: dict[str, list[NDArray[np.float64]]] = {"own": [], "another": []}
+    for number in held_out(corpus):
+        true = truth(corpus, number)
+        if true is None or true[0] < 4.0:
+            continue
+        for name, received in (("own", own(corpus, number)), ("another", another(corpus, number))):
+            answer = estimator.estimate(received, samples=2000)
+            off[name].append(answer.mean - true)
+            print(number, name, true.round(2), off[name][-1].round(3), answer.method, flush=True)
+        if len(off["own"]) == ANSWERED:
+            break
+    one, other = (np.sqrt((np.array(errors) ** 2).mean(axis=0)) for errors in off.values())
+    print(
+        f"RMSE of {ANSWERED}: own {one.round(3)}, another {other.round(3)}, ratios {(other / one).round(2)}"
+    )
+    assert np.all(other < 2.0 * one)

@@ -1,0 +1,212 @@
+"""`twin calibrate`: how far pictures of known inclusions are from what a model renders for them.
+
+The emulator, the learned light and the meshes behind them are off by about a per cent, ten times the noise of
+a picture: an estimator that trusts its chain is sure of nonsense where pictures come from elsewhere. What a
+few dozen pictures are off by is taken for a normal error of all that follow, the model's discrepancy (Kennedy
+and O'Hagan 2001; [kennedy2001]).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from twin import retake
+from twin.assessing import levels_of
+from twin.chain import BLOCK, whole_blocks
+from twin.complaint import DesignError, shown
+from twin.corpus import Corpus
+from twin.estimator import Estimator
+from twin.estimator_file import emulator_of, file_of, load_estimator, save_estimator
+from twin.fitting import inside, reachable
+from twin.imagined import Brightness, check_field, pictures
+from twin.pooled import each
+from twin.rendered import rendered
+from twin.train import LIKE, level_names, likeness_of
+
+Floats = NDArray[np.float64]
+Single = NDArray[np.float32]
+
+LEAST = 12
+"""Samples that a calibration needs."""
+_SHARES = (1e-3, 3e-3, 0.01, 0.03, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.97)
+_COMMON = (0.01, 0.1, 0.25, 0.5, 0.75, 1.0)
+
+
+@dataclass(frozen=True)
+class Task:
+    """One sample to render as the model does, as a worker process takes it."""
+
+    model: str
+    corpus: str
+    sample: int
+    place: Path
+
+
+def calibrate(
+    model: str | Path,
+    corpus: str | Path,
+    out: str | Path,
+    *,
+    samples: int | None = None,
+    workers: int | None = None,
+    progress: Callable[[str, float], None] = lambda stage, share: None,
+) -> str:
+    """Write a model that also knows how far pictures of a corpus are from its own, as OUT.safetensors and
+    OUT.json; say how far that is.
+
+    Parameters
+    ----------
+    samples : the first so many; all by default.
+
+    Raises
+    ------
+    DesignError
+        In one line: for another sensor, too few samples, a model that renders nothing.
+    fem.NotModelled
+        In one line, for a sample that the model's emulator does not know.
+    """
+    source, estimator, place = Corpus(corpus), load_estimator(model), Path(f"{out}.safetensors")
+    if not estimator.traced:
+        allowed = "one that was trained on a corpus with --traced"
+        raise DesignError("MODEL", "one without learned light", allowed, source=str(model))
+    levels = levels_of(source, estimator)
+    for field in source.plan.columns:
+        if "." in field:
+            check_field(field, source.name)
+    numbers = [int(n) for n in source.samples if source.plan.inclusion(int(n)) is not None][:samples]
+    if len(numbers) < LEAST:
+        raise DesignError("samples", shown(len(numbers)), f"{LEAST} or more inclusions", source=source.name)
+    key = hashlib.sha256((estimator.card["sha256"] + source.plan.head.samples.sha256).encode()).hexdigest()
+    folder = place.with_name(place.stem + ".parts") / f"rendered-{key[:16]}"
+    folder.mkdir(parents=True, exist_ok=True)
+    tasks = [Task(str(model), str(corpus), number, folder / f"{number:06d}.npz") for number in numbers]
+    left = [task for task in tasks if not task.place.is_file()]
+
+    def share(count: int) -> None:
+        progress("samples", 1.0 - (len(left) - count) / len(tasks))
+
+    share(0)
+    each(compare, left, workers or os.cpu_count() or 1, _one_thread, share)
+    values = [level_names(_values(source, number), levels) for number in numbers]
+    found = [np.load(task.place, allow_pickle=False) for task in tasks]
+    seen, own = (np.stack([one[name] for one in found]) for name in ("seen", "rendered"))
+    tared, off = own[:, :, 0] - own[:, :, 1], seen - own
+    shares = [
+        np.sqrt((off[:, :, 1] ** 2).mean(axis=(2, 3))) / own[:, :, 1].mean(axis=(2, 3)),
+        np.sqrt(((off[:, :, 0] - off[:, :, 1]) ** 2).mean(axis=(2, 3))) / tared.max(axis=(2, 3)),
+    ]
+    reference, of_tared = (100.0 * float(np.sqrt((one**2).mean())) for one in shares)
+    made = calibrated(estimator, values, seen, own)
+    card = {
+        **estimator.card,
+        "name": place.stem,
+        "calibrated": {
+            "corpus": source.name,
+            "samples": len(numbers),
+            "off_percent": {"references": reference, "tared": of_tared},
+        },
+    }
+    save_estimator(replace(made, card=card), emulator_of(file_of(model)), place)
+    return (
+        f"{len(numbers)} inclusions of {source.name}: references are off by {reference:.2f} % of their mean, "
+        f"tared pictures by {of_tared:.2f} % of their maximum (root mean square)\nmodel: {place}"
+    )
+
+
+def calibrated(estimator: Estimator, values: list[dict[str, float]], seen: Single, own: Single) -> Estimator:
+    """Return the estimator that knows of differences between pictures of the corpus and what it renders, both
+    (n, levels, 2, r, c) expected counts above black, for n specimens' values."""
+    chain, features = estimator.chain, estimator.features
+    errors = (features(seen) - features(own)).astype(np.float64)
+    mapped = pictures(chain, chain.inputs(values), Brightness.of(chain, values))
+    specimens = _drawn(estimator)
+    return replace(
+        estimator,
+        discrepancy=shrunk(errors, features.spread.astype(np.float64)),
+        novelty=likeness_of(chain, chain.inputs(specimens), specimens, seen - mapped, 0),
+    )
+
+
+def _drawn(estimator: Estimator) -> list[dict[str, float]]:
+    """Specimens of the estimator's prior."""
+    prior, rng = estimator.prior, np.random.default_rng(12)
+    low, high = prior.ranges.T
+    unknowns = rng.standard_normal((LIKE, len(prior.middle)))
+    unknowns[:, :5] = low + (high - low) * rng.random((LIKE, 5))
+    return [reachable(estimator.chain, prior.values(inside(prior, x))) for x in unknowns]
+
+
+def shrunk(errors: Floats, scale: Floats) -> Floats:
+    """Return the second moments (k, k) of few errors (n, k), shrunk towards their diagonal, and that towards
+    a common share of ``scale`` (k,) squared.
+
+    Both weights are those under which errors that are left out are likeliest; only the diagonal knows of
+    them. (Ledoit and Wolf 2004, [ledoit2004], weigh by the expected square instead, which forgives directions
+    that are taken for sure.)
+    """
+    n = len(errors)
+    z = errors / scale
+    moments = z.T @ z / n
+    own = np.diag(moments)
+    found: list[tuple[float, Floats]] = []
+    for a in _SHARES:
+        for b in _COMMON:
+            target = np.diag((1.0 - b) * own + b * own.mean())
+            # one error left out takes a rank from the moments (Sherman and Morrison 1950; [sherman1950])
+            root = linalg.cholesky((1.0 - a) * n / (n - 1) * moments + a * target, lower=True)
+            lost = (1.0 - a) / (n - 1) * (linalg.solve_triangular(root, z.T, lower=True) ** 2).sum(axis=0)
+            square = (n - 1) / (1.0 - a) * lost / (1.0 - lost)
+            logs = 2.0 * np.log(np.diag(root)).sum() + np.log1p(-lost)
+            found.append((float((square + logs).sum()), (1.0 - a) * moments + a * target))
+    best = min(found, key=lambda one: one[0])[1]
+    return np.asarray(best * np.outer(scale, scale))
+
+
+def _values(source: Corpus, number: int) -> dict[str, float]:
+    return {k: v for k, v in source.plan.parameters(number).items() if v is not None}
+
+
+@lru_cache(maxsize=1)
+def _loaded(model: str) -> Estimator:
+    return load_estimator(model)
+
+
+@lru_cache(maxsize=1)
+def _opened(corpus: str) -> Corpus:
+    return Corpus(corpus)
+
+
+def compare(task: Task) -> None:
+    """Keep what a corpus has of a sample, without noise, beside what the model renders; runs in a worker."""
+    estimator, source = _loaded(task.model), _opened(task.corpus)
+    levels = levels_of(source, estimator)
+    design = source.design_of(task.sample)
+
+    def coarse(layers: Single) -> Single:
+        charge = retake.charge(design, layers, None, (1, 1)) / np.float32(design.camera.gain_e_per_dn)
+        return retake.average(whole_blocks(charge), BLOCK)
+
+    seen = [
+        [coarse(layers(task.sample, level)) for layers in (source.layers, source.reference_layers)]
+        for level in levels
+    ]
+    values = level_names(_values(source, task.sample), levels)
+    own = rendered(estimator.chain, estimator.traced, values, threads=1)
+    part = task.place.with_name(f".{task.place.name}.{os.getpid()}.part.npz")
+    np.savez(part, seen=np.asarray(seen, np.float32), rendered=own)
+    os.replace(part, task.place)
+
+
+def _one_thread() -> None:
+    from threadpoolctl import threadpool_limits
+
+    threadpool_limits(1)

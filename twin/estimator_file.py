@@ -1,0 +1,242 @@
+"""The files of a trained estimator.
+
+A model is two files: NAME.safetensors holds arrays only (network, light map, features, likeness, the emulator
+of the mechanics), NAME.json its card. Neither can run code.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from dataclasses import fields
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors
+import safetensors.numpy
+import torch
+from numpy.typing import NDArray
+
+import fem
+from estimation.features import Features
+from estimation.light_map import LightMap
+from estimation.posterior import restored
+from scenes import traced
+from twin import likeness
+from twin.chain import Chain
+from twin.complaint import DesignError, shown
+from twin.design import parse_design
+from twin.estimator import Estimator
+from twin.fitting import Prior
+
+FORMAT = "tsis-estimator-2"
+_CARD_BYTES = 4 * 2**20
+_NEEDED = {
+    "design": dict,
+    "shape": list,
+    "bits": int,
+    "colour": str,
+    "indentation_mm": list,
+    "frames": list,
+    "ranges": dict,
+    "refuse_below": float,
+    "network": dict,
+    "light": dict,
+    "features": list,
+    "nuisances": list,
+    "traced": list,
+    "sha256": str,
+}
+
+
+def without_luminaires(tables: dict[str, Any]) -> dict[str, Any]:
+    """Design tables without files of luminaires: a model needs none, and a stranger's may name any file."""
+    leds = tables.get("leds")
+    if not isinstance(leds, list):
+        return tables
+    return {**tables, "leds": [{**led, "ies": None} if isinstance(led, dict) else led for led in leds]}
+
+
+def save_estimator(estimator: Estimator, emulator: bytes, path: str | Path) -> Path:
+    """Write NAME.safetensors and NAME.json; ``path`` is the former's. The card is written last."""
+    target = Path(path)
+    arrays: dict[str, NDArray[Any]] = {"emulator": np.frombuffer(emulator, np.uint8)}
+    parts: dict[str, Any] = {"light": estimator.chain.light, "features": estimator.features}
+    for name, part in parts.items():
+        arrays |= {
+            f"{name}.{field.name}": getattr(part, field.name)
+            for field in fields(part)
+            if isinstance(getattr(part, field.name), np.ndarray)
+        }
+    prior = estimator.prior
+    arrays |= {"prior.ranges": prior.ranges, "prior.mean": prior.mean, "prior.basis": prior.basis}
+    arrays |= {"error": estimator.error}
+    if estimator.discrepancy is not None:
+        arrays |= {"discrepancy": estimator.discrepancy}
+    for number, one in enumerate(estimator.traced):
+        arrays |= {f"traced.{number}.{name}": getattr(one, name) for name in traced.ARRAYS}
+    arrays |= {f"novelty.{name}": np.asarray(value) for name, value in estimator.novelty.items()}
+    arrays |= {f"network.{k}": v.detach().numpy() for k, v in estimator.network.state_dict().items()}
+    data = safetensors.numpy.save({name: np.ascontiguousarray(value) for name, value in arrays.items()})
+    card = {
+        **estimator.card,
+        "format": FORMAT,
+        "network": estimator.network.size,
+        "light": {"length": estimator.chain.light.length, "shape": list(estimator.chain.light.shape)},
+        "features": list(estimator.features.shape),
+        "nuisances": list(prior.names),
+        "traced": [
+            {"key": one.key, "presses": one.presses, "error_percent": one.error_percent}
+            for one in estimator.traced
+        ],
+        "sha256": hashlib.sha256(data).hexdigest(),
+    }
+    target.parent.mkdir(parents=True, exist_ok=True)
+    for place, text in (
+        (target, data),
+        (card_of(target), (json.dumps(card, indent=1, allow_nan=False) + "\n").encode()),
+    ):
+        part = place.with_name(f".{place.name}.{os.getpid()}.part")
+        part.write_bytes(text)
+        os.replace(part, place)
+    return target
+
+
+def file_of(model: str | Path) -> Path:
+    """Return the place of a model's arrays."""
+    place = Path(model)
+    return place if place.suffix == ".safetensors" else place.with_name(place.name + ".safetensors")
+
+
+def card_of(path: Path) -> Path:
+    """Return the place of a model's card."""
+    return path.with_suffix(".json")
+
+
+def load_estimator(path: str | Path) -> Estimator:
+    """Return a trained estimator; nothing in its files is trusted.
+
+    Raises
+    ------
+    DesignError
+        In one line.
+    """
+    place, name = file_of(path), str(path)
+    if not place.is_file() or not card_of(place).is_file():
+        allowed = "a .safetensors file of `twin train`, its .json beside it"
+        raise DesignError("MODEL", shown(name), allowed)
+    try:
+        card = _card(card_of(place))
+        data = place.read_bytes()
+        if hashlib.sha256(data).hexdigest() != card["sha256"]:
+            raise DesignError("sha256", "other arrays", "those that the card tells of", source=name)
+        return _assembled(card, safetensors.numpy.load(data))
+    except DesignError as error:
+        raise error.renamed(source=error.source or name) from None
+    except (
+        OSError,
+        KeyError,
+        IndexError,
+        ValueError,
+        TypeError,
+        OverflowError,
+        RecursionError,
+        safetensors.SafetensorError,
+    ) as error:
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise DesignError(
+            "MODEL", f"files that do not fit ({reason})", "those of `twin train`", source=name
+        ) from None
+
+
+def _card(place: Path) -> dict[str, Any]:
+    if place.stat().st_size > _CARD_BYTES:
+        raise ValueError("the card is too long")
+    card = json.loads(place.read_bytes())
+    if not isinstance(card, dict) or card.get("format") != FORMAT:
+        raise ValueError(f"format is not {FORMAT}")
+    for name, kind in _NEEDED.items():
+        if not isinstance(card.get(name), kind):
+            raise ValueError(f"{name} is not {kind.__name__}")
+    return card
+
+
+def _assembled(card: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Estimator:
+    for name, value in arrays.items():
+        if value.dtype.kind == "f" and not np.isfinite(value).all():
+            raise ValueError(f"{name} is not finite")
+    design = parse_design(without_luminaires(card["design"]))
+    said = card["light"]
+    light = LightMap(
+        arrays["light.centre"],
+        arrays["light.axes"],
+        arrays["light.nodes"],
+        float(said["length"]),
+        arrays["light.weights"],
+        arrays["light.mean"],
+        arrays["light.modes"],
+        tuple(int(side) for side in said["shape"]),
+    )
+    pixels = int(np.prod(light.shape))
+    mean, axes, noise, spread = (arrays[f"features.{name}"] for name in ("mean", "axes", "noise", "spread"))
+    levels, two, rows, columns = (int(side) for side in card["features"])
+    features = Features(mean, axes, noise, spread, (levels, two, rows, columns))
+    k = len(features.spread)
+    prior = Prior(
+        arrays["prior.ranges"],
+        tuple(map(str, card["nuisances"])),
+        arrays["prior.mean"],
+        arrays["prior.basis"],
+    )
+    fits = (
+        light.axes.shape[0] == len(light.centre)
+        and light.nodes.shape == (len(light.weights), light.axes.shape[1])
+        and light.modes.shape == (light.weights.shape[1], pixels)
+        and light.mean.shape == (pixels,)
+        and light.length > 0
+        and features.axes.shape == (k, int(np.prod(features.shape)))
+        and features.shape[0] == len(design.press.indentation_mm)
+        and features.shape[2:] == light.shape[1:]
+        and light.shape[0] == len(design.leds)
+        and arrays["error"].shape == (k, k)
+        and ("discrepancy" not in arrays or arrays["discrepancy"].shape == (k, k))
+        and prior.ranges.shape == (5, 2)
+        and prior.basis.shape[0] == len(prior.names) == len(prior.mean)
+    )
+    if not fits:
+        raise ValueError("shapes")
+    state = {
+        name.removeprefix("network."): torch.from_numpy(value.copy())
+        for name, value in arrays.items()
+        if name.startswith("network.")
+    }
+    network = restored(card["network"], state)
+    if network.size["k"] != k or network.size["p"] != 5:
+        raise ValueError("network.size")
+    emulator = fem.load_emulator(BytesIO(arrays["emulator"].tobytes()))
+    strange = {
+        name.removeprefix("novelty."): value for name, value in arrays.items() if name.startswith("novelty.")
+    }
+    if not likeness.fits(strange, (features.shape[0], *features.shape[2:])):
+        raise ValueError("novelty")
+    lights = tuple(
+        traced.assembled(
+            {name: arrays[f"traced.{number}.{name}"] for name in traced.ARRAYS},
+            str(said["key"]),
+            int(said["presses"]),
+            float(said["error_percent"]),
+        )
+        for number, said in enumerate(card["traced"])
+    )
+    chain = Chain(design, emulator, light)
+    parts = (chain, features, network, prior, arrays["error"], strange, lights)
+    return Estimator(card, *parts, arrays.get("discrepancy"))
+
+
+def emulator_of(path: str | Path) -> bytes:
+    """Return the emulator's file in a model's."""
+    with safetensors.safe_open(path, "numpy") as file:
+        return bytes(file.get_tensor("emulator").tobytes())
