@@ -27,7 +27,8 @@ class Features:
     ----------
     mean : (m,) of the stacked and whitened pictures, m = levels * 2 * r * c.
     axes : (k, m).
-    noise : (levels, 2) counts, standard deviation of tared picture and reference in a block of pixels.
+    noise : (levels, 2, 1, 1) or (levels, 2, r, c) counts, standard deviation of tared picture and reference
+        in a block of pixels.
     spread : (k,) standard deviation of the features over specimens, in those of the noise.
     shape : (levels, 2, r, c).
     """
@@ -46,7 +47,7 @@ class Features:
         """Tared pictures and references over the noise, (n, m)."""
         given = np.asarray(pictures, np.float32)
         tared = np.stack([given[:, :, 0] - given[:, :, 1], given[:, :, 1]], axis=2)
-        return np.asarray((tared / self.noise[:, :, None, None]).reshape(len(given), -1), np.float32)
+        return np.asarray((tared / self.noise).reshape(len(given), -1), np.float32)
 
     def only(self, blocks: NDArray[np.bool_]) -> Features:
         """Return the features that look at some blocks (r, c) of each picture alone."""
@@ -57,7 +58,8 @@ class Features:
     def onto(self) -> Single:
         """(levels, 2, r * c, k): what each block's counts of picture and reference add to the features."""
         levels, _, rows, columns = self.shape
-        axes = self.axes.reshape(-1, levels, 2, rows * columns) / self.noise[:, :, None]
+        axes = self.axes.reshape(-1, levels, 2, rows, columns) / self.noise
+        axes = axes.reshape(-1, levels, 2, rows * columns)
         tared, reference = axes[:, :, 0], axes[:, :, 1]
         return np.ascontiguousarray(
             np.stack([tared, reference - tared], axis=2).transpose(1, 2, 3, 0), np.float32
@@ -67,13 +69,13 @@ class Features:
 def compress(pictures: NDArray[np.floating], noise: NDArray[np.floating], *, most: int = 96) -> Features:
     """Find the components of pictures (n, levels, 2, r, c) without noise.
 
-    ``noise`` is (levels, 2), of tared picture and reference, counts. Components of which less is seen than
-    `_SEEN` of one exposure's noise are left out, and all beyond ``most``.
+    ``noise`` is (levels, 2) or (levels, 2, r, c), of tared picture and reference, counts. Components of which
+    less is seen than `_SEEN` of one exposure's noise are left out, and all beyond ``most``.
     """
     first = Features(
         np.zeros(1, np.float32),
         np.zeros((1, 1), np.float32),
-        np.asarray(noise, np.float32),
+        np.asarray(noise, np.float32).reshape(*noise.shape, *(1,) * (4 - noise.ndim)),
         np.zeros(1, np.float32),
         tuple(pictures.shape[1:]),
     )

@@ -15,33 +15,21 @@ def likelihood(covariance: np.ndarray, errors: np.ndarray) -> float:
 
 def test_few_errors_give_a_covariance_to_be_trusted() -> None:
     """Of 15 errors in 40 dimensions: new ones are likelier by it than by the diagonal alone where errors go
-    together, and than by a multiple of the scale; of many, it is the truth."""
+    together; of many, it is the truth."""
     rng = np.random.default_rng(0)
     together = rng.standard_normal((K, 2))
     true = together @ together.T + 0.1 * np.eye(K)
-    some, many, new = (rng.standard_normal((n, K)) @ np.linalg.cholesky(true).T for n in (15, 4000, 4000))
-    scale = np.full(K, 2.0)
+    some, many, new = (rng.standard_normal((n, K)) @ np.linalg.cholesky(true).T for n in (15, 1500, 1500))
     best = likelihood(true, new)
-    found = best - likelihood(shrunk(some, scale), new)
+    found = best - likelihood(shrunk(some), new)
     moments = np.diag((some**2).mean(axis=0))
     assert 0.0 < found < best - likelihood(moments, new) - 5.0
-    assert found < best - likelihood(moments.mean() * K * np.eye(K), new) - 5.0
-    assert 0.0 < best - likelihood(shrunk(many, scale), new) < 0.3
-
-
-def test_units_do_not_matter() -> None:
-    """Errors that go alone, each in a unit of its own: found in those units."""
-    rng = np.random.default_rng(1)
-    units = np.logspace(-3, 3, K)
-    errors = rng.standard_normal((60, K))
-    plain, scaled = shrunk(errors, np.ones(K)), shrunk(errors * units, units)
-    assert np.allclose(scaled, plain * np.outer(units, units))
-    assert likelihood(plain, rng.standard_normal((2000, K))) > -0.5 * K - 1.0
+    assert 0.0 < best - likelihood(shrunk(many), new) < 0.3
 
 
 def test_a_bias_counts_as_an_error() -> None:
     """What all pictures are off by in the same way is not taken for sure."""
     bias = np.linspace(-3.0, 3.0, K)
-    found = shrunk(bias + 0.1 * np.random.default_rng(2).standard_normal((20, K)), np.ones(K))
+    found = shrunk(bias + 0.1 * np.random.default_rng(2).standard_normal((20, K)))
     way = bias / np.linalg.norm(bias)
     assert way @ found @ way > 0.5 * bias @ bias

@@ -103,6 +103,15 @@ FLAGS = {
         ["train", "c", "--samples", "3", "--out", "m"],
         ["--samples", "3", ">= 30"],
     ),
+    "a calibration without a place": (["calibrate", "m", "c"], ["--out", "the model to write"]),
+    "a calibration by no corpus": (
+        ["calibrate", "m", "c", "--out", "a"],
+        ["CORPUS", "'c'", "folder of a corpus"],
+    ),
+    "a calibration by no samples": (
+        ["calibrate", "m", "c", "--samples", "0", "--out", "a"],
+        ["--samples", ">= 1"],
+    ),
     "an assessment without a place": (["assess", "m", "c"], ["--out", "folder"]),
     "an assessment of no corpus": (
         ["assess", "m", "c", "--out", "a"],

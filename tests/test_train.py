@@ -1,6 +1,7 @@
 """``twin train`` from a corpus to a model that answers, on a small camera with a made-up emulator."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +10,10 @@ from corpora import freeze_tiny, make_up_emulator
 
 import twin
 from twin import index, sample, store
+from twin.calibrate import calibrate
 from twin.complaint import DesignError
-from twin.estimator import Estimator
-from twin.estimator_file import load_estimator
+from twin.estimator import Estimator, Sight
+from twin.estimator_file import emulator_of, load_estimator, save_estimator
 from twin.plan import load_plan
 from twin.received import Received
 from twin.train import train
@@ -117,3 +119,27 @@ def test_a_corpus_that_cannot_teach_is_refused(tmp_path):
     index.build(place, load_plan(place), store.sha256(place / "plan.json"))
     with pytest.raises(DesignError):
         train(place, tmp_path / "m", minutes=0.1)
+
+
+def test_only_a_model_that_renders_is_calibrated(corpus, model, tmp_path):
+    with pytest.raises(DesignError, match="without learned light"):
+        calibrate(model, corpus, tmp_path / "m")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_calibrated_model_is_kept_and_read(model, tmp_path):
+    """Features of their own with noise by blocks, and what they are off by; a stranger's are checked."""
+    estimator = load_estimator(model)
+    shape = estimator.features.shape
+    noise = np.ones(shape, np.float32) * estimator.features.noise
+    sight = Sight(replace(estimator.features, noise=noise), estimator.error, 2.0 * estimator.error)
+    place = tmp_path / "m.safetensors"
+    save_estimator(replace(estimator, calibration=sight), emulator_of(model), place)
+    again = load_estimator(place).calibration
+    assert again is not None and np.array_equal(again.discrepancy, sight.discrepancy)
+    pictures = np.random.default_rng(0).random((2, *shape), np.float32)
+    assert np.array_equal(again.features(pictures), estimator.features(pictures))
+    wrong = replace(sight, discrepancy=np.eye(3))
+    save_estimator(replace(estimator, calibration=wrong), emulator_of(model), place)
+    with pytest.raises(DesignError, match="do not fit"):
+        load_estimator(place)

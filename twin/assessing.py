@@ -190,14 +190,17 @@ def answer(task: Task) -> None:
             found["bound"] = found["deflection"] = None
         if task.rendered and estimator.traced:
             refined = estimator.refined(
-                told[0], frames, drawn.mean(axis=0), samples=_DRAWS, seed=task.seed, begin=near, threads=1
+                seen, frames, drawn.mean(axis=0), samples=_DRAWS, seed=task.seed, begin=near, threads=1
             )
             if refined is not None:
                 near = refined.near
-                found["misfit"] = refined.fitted.chi_square / len(estimator.features.spread)
+                found["misfit"] = refined.fitted.chi_square / len(estimator.sight.features.spread)
                 found["renders"], found["explains"] = refined.renders, refined.explains
-                if refined.explains:
-                    found["rendered"] = _short(refined.samples, truth)
+            if refined is not None and refined.explains:
+                found["rendered"] = _short(refined.samples, truth)
+            elif estimator.calibration is not None:
+                fitted = estimator.fitted(seen, frames, drawn.mean(axis=0))
+                found["rendered"] = _short(estimator.normal(fitted, _DRAWS, task.seed), truth)
     part = task.place.with_name(f".{task.place.name}.{os.getpid()}.part")
     write_json(part, row)
     os.replace(part, task.place)

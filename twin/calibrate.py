@@ -18,16 +18,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
+from scipy.ndimage import gaussian_filter
 
+from estimation.features import compress
 from twin import retake
 from twin.assessing import levels_of
 from twin.chain import BLOCK, whole_blocks
 from twin.complaint import DesignError, shown
 from twin.corpus import Corpus
-from twin.estimator import Estimator
+from twin.estimator import Estimator, Sight
 from twin.estimator_file import emulator_of, file_of, load_estimator, save_estimator
 from twin.fitting import inside, reachable
-from twin.imagined import Brightness, check_field, pictures
+from twin.imagined import Brightness, check_field, mean_variance, pictures
 from twin.pooled import each
 from twin.rendered import rendered
 from twin.train import LIKE, level_names, likeness_of
@@ -39,6 +41,7 @@ LEAST = 12
 """Samples that a calibration needs."""
 _SHARES = (1e-3, 3e-3, 0.01, 0.03, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.97)
 _COMMON = (0.01, 0.1, 0.25, 0.5, 0.75, 1.0)
+_NEAR = 1.5  # blocks over which squared differences are averaged: few samples tell each block's badly
 
 
 @dataclass(frozen=True)
@@ -124,16 +127,24 @@ def calibrate(
 
 def calibrated(estimator: Estimator, values: list[dict[str, float]], seen: Single, own: Single) -> Estimator:
     """Return the estimator that knows of differences between pictures of the corpus and what it renders, both
-    (n, levels, 2, r, c) expected counts above black, for n specimens' values."""
-    chain, features = estimator.chain, estimator.features
-    errors = (features(seen) - features(own)).astype(np.float64)
+    (n, levels, 2, r, c) expected counts above black, for n specimens' values.
+
+    Fits look less where in the pictures these differences are: new features weigh each block by its noise and
+    by what it is off.
+    """
+    chain, specimens = estimator.chain, _drawn(estimator)
+    bright = Brightness.of(chain, specimens)
+    many = pictures(chain, chain.inputs(specimens), bright)
     mapped = pictures(chain, chain.inputs(values), Brightness.of(chain, values))
-    specimens = _drawn(estimator)
-    return replace(
-        estimator,
-        discrepancy=shrunk(errors, features.spread.astype(np.float64)),
-        novelty=likeness_of(chain, chain.inputs(specimens), specimens, seen - mapped, 0),
-    )
+    noise = mean_variance(chain.design, many, bright.gain, 1.0).mean(axis=0)
+    off = seen - own
+    apart = np.stack([off[:, :, 0] - off[:, :, 1], off[:, :, 1]], axis=2)
+    missed = gaussian_filter((apart**2).mean(axis=0), (0.0, 0.0, _NEAR, _NEAR))
+    features = compress(many, np.sqrt(np.stack([noise.sum(axis=1), noise[:, 1]], axis=1) + missed))
+    told, rendered_, learned = (features(one).astype(np.float64) for one in (seen, own, mapped))
+    sight = Sight(features, shrunk(rendered_ - learned), shrunk(told - rendered_))
+    novelty = likeness_of(chain, chain.inputs(specimens), specimens, seen - mapped, 0)
+    return replace(estimator, calibration=sight, novelty=novelty)
 
 
 def _drawn(estimator: Estimator) -> list[dict[str, float]]:
@@ -145,17 +156,16 @@ def _drawn(estimator: Estimator) -> list[dict[str, float]]:
     return [reachable(estimator.chain, prior.values(inside(prior, x))) for x in unknowns]
 
 
-def shrunk(errors: Floats, scale: Floats) -> Floats:
+def shrunk(errors: Floats) -> Floats:
     """Return the second moments (k, k) of few errors (n, k), shrunk towards their diagonal, and that towards
-    a common share of ``scale`` (k,) squared.
+    its mean.
 
     Both weights are those under which errors that are left out are likeliest; only the diagonal knows of
     them. (Ledoit and Wolf 2004, [ledoit2004], weigh by the expected square instead, which forgives directions
     that are taken for sure.)
     """
     n = len(errors)
-    z = errors / scale
-    moments = z.T @ z / n
+    moments = errors.T @ errors / n
     own = np.diag(moments)
     found: list[tuple[float, Floats]] = []
     for a in _SHARES:
@@ -163,12 +173,13 @@ def shrunk(errors: Floats, scale: Floats) -> Floats:
             target = np.diag((1.0 - b) * own + b * own.mean())
             # one error left out takes a rank from the moments (Sherman and Morrison 1950; [sherman1950])
             root = linalg.cholesky((1.0 - a) * n / (n - 1) * moments + a * target, lower=True)
-            lost = (1.0 - a) / (n - 1) * (linalg.solve_triangular(root, z.T, lower=True) ** 2).sum(axis=0)
+            lost = (
+                (1.0 - a) / (n - 1) * (linalg.solve_triangular(root, errors.T, lower=True) ** 2).sum(axis=0)
+            )
             square = (n - 1) / (1.0 - a) * lost / (1.0 - lost)
             logs = 2.0 * np.log(np.diag(root)).sum() + np.log1p(-lost)
             found.append((float((square + logs).sum()), (1.0 - a) * moments + a * target))
-    best = min(found, key=lambda one: one[0])[1]
-    return np.asarray(best * np.outer(scale, scale))
+    return np.asarray(min(found, key=lambda one: one[0])[1])
 
 
 def _values(source: Corpus, number: int) -> dict[str, float]:

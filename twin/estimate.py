@@ -25,6 +25,7 @@ _UNKNOWN = 0.8
 _METHODS = {
     "rendered": "refined by rendering the most probable inclusion",
     "network": "by the network alone",
+    "fitted": "by the most probable inclusion of the calibrated chain, without rendering",
 }
 _WORDS = {"size_mm": ("size", "mm"), "depth_mm": ("depth", "mm"), "modulus_kPa": ("modulus", "kPa")}
 

@@ -17,7 +17,7 @@ from scenes.traced import TracedLight
 from twin import likeness
 from twin.chain import BLOCK, Chain, whole_blocks
 from twin.estimates import NAMES, Estimate
-from twin.fitting import Fitted, Near, Prior, fit, limits
+from twin.fitting import Fitted, Near, Prior, fit, limits, reachable
 from twin.imagined import mean_variance
 from twin.put_back import put_back, where
 from twin.received import Received
@@ -28,6 +28,26 @@ from twin.retake import average
 _LEFT_PERCENT = 0.05  # of misalignment, standard deviation, after pictures were put back
 
 Single = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """What a fit looks at, and what that is off by.
+
+    Attributes
+    ----------
+    features : of pictures.
+    error : (k, k) second moments of what the chain's features are off by.
+    discrepancy : (k, k) of what rendered ones are off by, too (`twin.calibrate`).
+    """
+
+    features: Features
+    error: NDArray[np.float64]
+    discrepancy: NDArray[np.float64] | float = 0.0
+
+    def only(self, blocks: NDArray[np.bool_]) -> Sight:
+        """Return the same of some blocks (r, c) of each picture alone."""
+        return replace(self, features=self.features.only(blocks))
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,8 +65,8 @@ class Estimator:
     """What `twin.likeness.learn` gave."""
     traced: tuple[TracedLight, ...] = ()
     """Learned light of each band, to render with; none where the corpus was traced press by press."""
-    discrepancy: NDArray[np.float64] | None = None
-    """(k, k) second moments of what pictures are off from what is rendered (`twin.calibrate`)."""
+    calibration: Sight | None = None
+    """What `twin calibrate` gave; the network does not know of it."""
 
     def estimate(
         self, received: Received, *, samples: int = 4000, seed: int = 0, rendered: bool = True
@@ -69,14 +89,18 @@ class Estimator:
         refined = None
         if rendered and self.traced and reason is None and presence >= 0.5:
             start = drawn.mean(axis=0)
-            refined = self.refined(told[0], frames, start, samples=samples, seed=seed)
+            refined = self.refined(seen, frames, start, samples=samples, seed=seed)
             if refined is None or not refined.explains:
                 again, back = self._put_back(received, frames, start, samples, seed)
                 if again is not None:
                     refined, seen = again, back
-        fitted = self.fitted(told[0], frames, drawn.mean(axis=0)) if refined is None else refined.fitted
-        trusted = refined is not None and refined.explains
-        wanted = (refined.samples if refined is not None and trusted else drawn)[:, : len(NAMES)]
+        fitted = self.fitted(seen, frames, drawn.mean(axis=0)) if refined is None else refined.fitted
+        method, answer = "network", drawn
+        if refined is not None and refined.explains:
+            method, answer = "rendered", refined.samples
+        elif self.calibration is not None:
+            method, answer = "fitted", self.normal(fitted, samples, seed)
+        wanted = answer[:, : len(NAMES)]
         gain = np.array([self.chain.gain(self.prior.values(fitted.x[: len(self.prior.middle)]))])
         variance = mean_variance(self.chain.design, seen[None], gain, frames)[0]
         return Estimate(
@@ -91,13 +115,25 @@ class Estimator:
             np.asarray(seen[:, 0] - seen[:, 1], np.float64),
             np.asarray(fitted.pictures[:, 0] - fitted.pictures[:, 1], np.float64),
             np.sqrt(variance.sum(axis=1, dtype=np.float64)),
-            "rendered" if trusted else "network",
-            fitted.chi_square / len(self.features.spread),
+            method,
+            fitted.chi_square / len(self.sight.features.spread),
         )
+
+    def normal(self, fitted: Fitted, samples: int, seed: int) -> NDArray[np.float64]:
+        """Samples (n, 5) about the most probable specimen, within the prior's ranges."""
+        rng = np.random.default_rng([seed, 13])
+        low, high = self.prior.ranges.T
+        drawn = rng.multivariate_normal(fitted.x[:5], fitted.covariance[:5, :5], samples)
+        return np.clip(drawn, low, high)
+
+    @property
+    def sight(self) -> Sight:
+        """What fits look at."""
+        return self.calibration or Sight(self.features, self.error)
 
     def refined(
         self,
-        told: Single,
+        seen: Single,
         frames: float,
         start: NDArray[np.floating],
         *,
@@ -105,24 +141,29 @@ class Estimator:
         seed: int = 0,
         begin: Near | None = None,
         threads: int | None = None,
+        prior: Prior | None = None,
+        blocks: NDArray[np.bool_] | None = None,
     ) -> Refined | None:
-        """Return the posterior of features (k,) by rendering, from a start (5,); None where the best fit lies
-        beyond what the emulator or the learned light know."""
-        x = np.concatenate([start, np.zeros(self.prior.basis.shape[1])])
+        """Return the posterior by rendering, of coarse counts (levels, 2, r, c) or some ``blocks`` (r, c) of
+        them, from a start (5,); None where the learned light does not know the best fit."""
+        prior = prior or self.prior
+        sight = self.sight if blocks is None else self.sight.only(blocks)
         try:
             return refine(
                 self.chain,
-                self.features,
-                self.prior,
-                self.error,
-                told,
+                sight.features,
+                prior,
+                sight.error,
+                sight.features(seen[None])[0],
                 frames,
-                x,
-                lambda values: render(self.chain, self.traced, values, threads=threads),
+                np.concatenate([start, np.zeros(prior.basis.shape[1])]),
+                lambda values: render(
+                    self.chain, self.traced, reachable(self.chain, dict(values)), threads=threads
+                ),
                 samples=samples,
                 seed=seed,
                 begin=begin,
-                always=self._off,
+                always=sight.discrepancy,
             )
         except (fem.NotModelled, NotModelled):
             return None
@@ -132,18 +173,13 @@ class Estimator:
     ) -> tuple[Refined | None, Single]:
         """Return what `refined` does of pictures of a camera that stands a little off, and these pictures put
         back; blocks that it has not seen are those that are expected."""
-        parts = (self.chain, self.features, self.error, self.coarse)
+        sight = self.sight
+        parts = (self.chain, sight.features, sight.error + sight.discrepancy, self.coarse)
         matrix = where(*parts, self.prior.of_another_camera(self._pattern), received, start)
         now, blocks = put_back(received, matrix)
-        left = self.prior.of_another_camera(self._pattern, _LEFT_PERCENT)
-        placed = replace(self, features=self.features.only(blocks), prior=left)
-        back = self.coarse(now)
-        found = placed.refined(placed.features(back[None])[0], frames, start, samples=samples, seed=seed)
+        back, prior = self.coarse(now), self.prior.of_another_camera(self._pattern, _LEFT_PERCENT)
+        found = self.refined(back, frames, start, samples=samples, seed=seed, prior=prior, blocks=blocks)
         return found, back if found is None else np.where(blocks, back, found.fitted.pictures)
-
-    @property
-    def _off(self) -> NDArray[np.float64] | float:
-        return 0.0 if self.discrepancy is None else self.discrepancy
 
     @property
     def _pattern(self) -> float:
@@ -162,12 +198,16 @@ class Estimator:
 
     def limits(self, values: Mapping[str, float], frames: float) -> tuple[NDArray[np.float64], float]:
         """Return the bound and the deflection at true values; see `fitting.limits`."""
-        return limits(self.chain, self.features, self.prior, values, frames, self._off)
+        sight = self.sight
+        return limits(self.chain, sight.features, self.prior, values, frames, sight.discrepancy)
 
-    def fitted(self, told: Single, frames: float, start: NDArray[np.floating]) -> Fitted:
-        """Return the most probable specimen by the chain, for features (k,), from a start (5,)."""
+    def fitted(self, seen: Single, frames: float, start: NDArray[np.floating]) -> Fitted:
+        """Return the most probable specimen by the chain, for coarse counts (levels, 2, r, c), from a start
+        (5,)."""
         x = np.concatenate([start, np.zeros(self.prior.basis.shape[1])])
-        return fit(self.chain, self.features, self.prior, told, frames, x, self.error + self._off)
+        sight = self.sight
+        told, error = sight.features(seen[None])[0], sight.error + sight.discrepancy
+        return fit(self.chain, sight.features, self.prior, told, frames, x, error)
 
 
 def black(chain: Chain) -> float:

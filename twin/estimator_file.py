@@ -29,10 +29,11 @@ from twin import likeness
 from twin.chain import Chain
 from twin.complaint import DesignError, shown
 from twin.design import parse_design
-from twin.estimator import Estimator
+from twin.estimator import Estimator, Sight
 from twin.fitting import Prior
 
 FORMAT = "tsis-estimator-2"
+_FEATURES = ("mean", "axes", "noise", "spread")
 _CARD_BYTES = 4 * 2**20
 _NEEDED = {
     "design": dict,
@@ -74,8 +75,9 @@ def save_estimator(estimator: Estimator, emulator: bytes, path: str | Path) -> P
     prior = estimator.prior
     arrays |= {"prior.ranges": prior.ranges, "prior.mean": prior.mean, "prior.basis": prior.basis}
     arrays |= {"error": estimator.error}
-    if estimator.discrepancy is not None:
-        arrays |= {"discrepancy": estimator.discrepancy}
+    if (sight := estimator.calibration) is not None:
+        arrays |= {f"sight.{name}": getattr(sight.features, name) for name in _FEATURES}
+        arrays |= {"sight.error": sight.error, "sight.discrepancy": np.asarray(sight.discrepancy)}
     for number, one in enumerate(estimator.traced):
         arrays |= {f"traced.{number}.{name}": getattr(one, name) for name in traced.ARRAYS}
     arrays |= {f"novelty.{name}": np.asarray(value) for name, value in estimator.novelty.items()}
@@ -181,10 +183,16 @@ def _assembled(card: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Estimat
         tuple(int(side) for side in said["shape"]),
     )
     pixels = int(np.prod(light.shape))
-    mean, axes, noise, spread = (arrays[f"features.{name}"] for name in ("mean", "axes", "noise", "spread"))
     levels, two, rows, columns = (int(side) for side in card["features"])
-    features = Features(mean, axes, noise, spread, (levels, two, rows, columns))
+    features = _features(arrays, "features", (levels, two, rows, columns))
     k = len(features.spread)
+    sight = None
+    if "sight.error" in arrays:
+        own = _features(arrays, "sight", features.shape)
+        sight = Sight(own, arrays["sight.error"], arrays["sight.discrepancy"])
+        square = (len(own.spread),) * 2
+        if sight.error.shape != square or arrays["sight.discrepancy"].shape != square:
+            raise ValueError("shapes")
     prior = Prior(
         arrays["prior.ranges"],
         tuple(map(str, card["nuisances"])),
@@ -197,12 +205,10 @@ def _assembled(card: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Estimat
         and light.modes.shape == (light.weights.shape[1], pixels)
         and light.mean.shape == (pixels,)
         and light.length > 0
-        and features.axes.shape == (k, int(np.prod(features.shape)))
         and features.shape[0] == len(design.press.indentation_mm)
         and features.shape[2:] == light.shape[1:]
         and light.shape[0] == len(design.leds)
         and arrays["error"].shape == (k, k)
-        and ("discrepancy" not in arrays or arrays["discrepancy"].shape == (k, k))
         and prior.ranges.shape == (5, 2)
         and prior.basis.shape[0] == len(prior.names) == len(prior.mean)
     )
@@ -232,8 +238,17 @@ def _assembled(card: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Estimat
         for number, said in enumerate(card["traced"])
     )
     chain = Chain(design, emulator, light)
-    parts = (chain, features, network, prior, arrays["error"], strange, lights)
-    return Estimator(card, *parts, arrays.get("discrepancy"))
+    return Estimator(card, chain, features, network, prior, arrays["error"], strange, lights, sight)
+
+
+def _features(arrays: dict[str, NDArray[Any]], start: str, shape: tuple[int, int, int, int]) -> Features:
+    mean, axes, noise, spread = (arrays[f"{start}.{name}"] for name in _FEATURES)
+    if axes.shape != (len(spread), int(np.prod(shape))) or mean.shape != axes.shape[1:]:
+        raise ValueError("shapes")
+    noise = noise.reshape(*noise.shape, *(1,) * (4 - noise.ndim))  # older models have two axes
+    if noise.shape not in ((*shape[:2], 1, 1), shape):
+        raise ValueError("shapes")
+    return Features(mean, axes, noise, spread, shape)
 
 
 def emulator_of(path: str | Path) -> bytes:

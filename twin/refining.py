@@ -106,7 +106,7 @@ def refine(
     assert near is not None
     louder = found.chi_square / len(features.spread) if _strange(found, features) else 1.0
     followed = valley(chain, features, prior, observed, frames, found, remains, near, louder)
-    ends = followed.ends()
+    ends = [inside(prior, x) for x in followed.ends()]
     if ends[1][_HELD] - ends[0][_HELD] > _LONG * (prior.ranges[_HELD, 1] - prior.ranges[_HELD, 0]):
         seen = []
         for x in ends:
