@@ -34,7 +34,15 @@ def with_field(field, text):
 
 
 def test_the_shipped_studies():
-    assert shipped_studies() == ["paper", "paper-quick", "phantoms", "pictures", "quick", "solved", "training"]
+    assert shipped_studies() == [
+        "paper",
+        "paper-quick",
+        "phantoms",
+        "pictures",
+        "quick",
+        "solved",
+        "training",
+    ]
     for name in shipped_studies():
         assert load_study(name).study.name == name
     paper = load_study("paper").study
