@@ -86,13 +86,15 @@ def refine(
     error : (k, k) covariance of the light map's errors in features.
     start : (5 + q,) where the fit begins.
     render : expected pictures (levels, 2, r, c) of a specimen's values, by light transport.
-    begin : what is known of the light map's errors near the start, from pictures of the same specimen.
+    begin : what is known of the light map's errors around the specimen, from other pictures of it: the
+        fit begins there, for far from it that says nothing.
     always : (k, k) covariance of what rendered pictures are off by.
     """
     near = begin
     remains = _REMAINS**2 * error + always
     first = error + always if near is None else remains
-    found = fit(chain, features, prior, observed, frames, start, first, near)
+    begins = start if near is None else near.at
+    found = fit(chain, features, prior, observed, frames, begins, first, near)
     for renders in range(1, _RENDERS + 1):  # noqa: B007
         at = found.x
         values = prior.values(at)
