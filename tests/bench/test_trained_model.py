@@ -83,7 +83,7 @@ def test_valid_pictures_are_taken_and_others_refused(estimator: Estimator, corpu
     valid = [refused(estimator, own(corpus, number)) for number in numbers]
     moved = [refused(estimator, another(corpus, number)) for number in numbers[::4]]
     large = next(n for n in numbers if (size := truth(corpus, n)) is not None and size[0] > 7.0)
-    strange = aliens(own(corpus, large))
+    strange = list(aliens(own(corpus, large)))
     found = Counter(one.family for one in strange if refused(estimator, one.received))
     print(
         f"\nrefused: {sum(valid)} of {len(valid)} valid, {sum(moved)} of {len(moved)} of another camera, "
