@@ -93,7 +93,7 @@ def assess(
         progress("samples", 1.0 - (len(left) - count) / max(len(tasks), 1))
 
     share(0)
-    each(answer, left, workers or os.cpu_count() or 1, _one_thread, share)
+    each(answer, left, workers or os.cpu_count() or 1, one_thread, share)
     rows = [json.loads(task.place.read_bytes()) for task in tasks]
     record = {**told, "corpus_name": source.name, **record_of(rows, estimator.prior.ranges, rendered)}
     from twin.assessing_figure import draw
@@ -143,18 +143,20 @@ def _done(task: Task) -> bool:
 
 
 @lru_cache(maxsize=1)
-def _loaded(model: str) -> Estimator:
+def loaded(model: str) -> Estimator:
+    """Return a model, loaded once in a worker process."""
     return load_estimator(model)
 
 
 @lru_cache(maxsize=1)
-def _opened(corpus: str) -> Corpus:
+def opened(corpus: str) -> Corpus:
+    """Return a corpus, opened once in a worker process."""
     return Corpus(corpus)
 
 
 def answer(task: Task) -> None:
     """Answer one sample and write its record; runs in a worker process."""
-    estimator, source = _loaded(task.model), _opened(task.corpus)
+    estimator, source = loaded(task.model), opened(task.corpus)
     plan = source.plan
     levels = levels_of(source, estimator)
     values = level_names({k: v for k, v in plan.parameters(task.sample).items() if v is not None}, levels)
@@ -211,7 +213,8 @@ def _short(drawn: NDArray[np.float64], truth: NDArray[np.float64]) -> dict[str, 
     return {name: getattr(one, name)[0].tolist() for name in SHORT}
 
 
-def _one_thread() -> None:
+def one_thread() -> None:
+    """Keep a worker process to one core."""
     import torch
     from threadpoolctl import threadpool_limits
 

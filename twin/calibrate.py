@@ -12,7 +12,6 @@ import hashlib
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +21,7 @@ from scipy.ndimage import gaussian_filter
 
 from estimation.features import compress
 from twin import retake
-from twin.assessing import levels_of
+from twin.assessing import levels_of, loaded, one_thread, opened
 from twin.chain import BLOCK, whole_blocks
 from twin.complaint import DesignError, shown
 from twin.corpus import Corpus
@@ -98,7 +97,7 @@ def calibrate(
         progress("samples", 1.0 - (len(left) - count) / len(tasks))
 
     share(0)
-    each(compare, left, workers or os.cpu_count() or 1, _one_thread, share)
+    each(compare, left, workers or os.cpu_count() or 1, one_thread, share)
     values = [level_names(_values(source, number), levels) for number in numbers]
     found = [np.load(task.place, allow_pickle=False) for task in tasks]
     seen, own = (np.stack([one[name] for one in found]) for name in ("seen", "rendered"))
@@ -186,19 +185,9 @@ def _values(source: Corpus, number: int) -> dict[str, float]:
     return {k: v for k, v in source.plan.parameters(number).items() if v is not None}
 
 
-@lru_cache(maxsize=1)
-def _loaded(model: str) -> Estimator:
-    return load_estimator(model)
-
-
-@lru_cache(maxsize=1)
-def _opened(corpus: str) -> Corpus:
-    return Corpus(corpus)
-
-
 def compare(task: Task) -> None:
     """Keep what a corpus has of a sample, without noise, beside what the model renders; runs in a worker."""
-    estimator, source = _loaded(task.model), _opened(task.corpus)
+    estimator, source = loaded(task.model), opened(task.corpus)
     levels = levels_of(source, estimator)
     design = source.design_of(task.sample)
 
@@ -215,9 +204,3 @@ def compare(task: Task) -> None:
     part = task.place.with_name(f".{task.place.name}.{os.getpid()}.part.npz")
     np.savez(part, seen=np.asarray(seen, np.float32), rendered=own)
     os.replace(part, task.place)
-
-
-def _one_thread() -> None:
-    from threadpoolctl import threadpool_limits
-
-    threadpool_limits(1)
