@@ -136,13 +136,14 @@ def _draw(record: dict[str, Any], place: Path) -> None:
     sizes = [row["samples"] for row in record["curve"]]
     labels = ("size d / mm", "depth h / mm", "modulus E / kPa")
     for number, (axis, label) in enumerate(zip(axes, labels, strict=True)):
-        axis.loglog(
+        axis.semilogx(
             sizes, [row["rmse"][number] for row in record["curve"]], "o-", color=BLUE, label="fit alone"
         )
         axis.axhline(record["bound"][number], color=RED, lw=1.0, label="bound")
         axis.set(xlabel="samples that light was learned from", ylabel=f"RMSE of {label}")
         axis.set_xticks(sizes, [str(size) for size in sizes])
         axis.minorticks_off()
+        axis.set_ylim(bottom=0.0)
         axis.grid(color=GREY, alpha=0.3)
     axes[0].legend(frameon=False, fontsize=8)
     figure.savefig(place, dpi=130)
