@@ -33,8 +33,8 @@ def where(
     """Return the matrix (3, 3) from where a place should be to where it is in the pictures received.
 
     Where the camera stands is fitted to the coarse pictures, with size, depth and modulus of the start (5,)
-    held; they blur too much to fit more, so all pixels are then taken from where they are, and what is left
-    is fitted.
+    held; they blur too much to fit more. All pixels are then taken from where they are, and what is left is
+    fitted with the inclusion: one that is held a little wrong moves the camera by pixels.
 
     Parameters
     ----------
@@ -42,11 +42,11 @@ def where(
     """
     x = np.concatenate([start, np.zeros(prior.basis.shape[1])])
     matrix, shape = np.eye(3), (received.images.shape[1], received.images.shape[2])
-    for _ in range(_ROUNDS):
+    for number in range(_ROUNDS):
         now, blocks = put_back(received, matrix)
         seen = features.only(blocks)
         told = seen(coarse(now)[None])[0]
-        x = fit(chain, seen, prior, told, 1.0, x, error, held=_HELD).x
+        x = fit(chain, seen, prior, told, 1.0, x, error, held=0 if number else _HELD).x
         values = prior.values(x)
         matrix = matrix @ np.linalg.inv(placement(shape, *(values[name] for name in ALIGNMENT)))
         x[-len(ALIGNMENT) :] = 0.0
