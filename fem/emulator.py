@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -24,7 +24,7 @@ from fem.emulator_limits import check, within
 from fem.mesh import Geometry
 from fem.model import Inclusion, Probe, Slab
 from fem.regression import Regression
-from fem.sampling import CLEARANCE, Plan, contrast, lines, quadratic
+from fem.sampling import CLEARANCE, Plan, contrast, cubic, lines
 from fem.solving import knots
 from fem.topology import Resolution
 
@@ -34,6 +34,8 @@ Floats = NDArray[np.float64]
 CENTRED = [0, 1, 4, 5, 6]
 """The inputs that are no offsets: all that the gain from a finer mesh depends on, in the mesh's
 coordinates."""
+OFFSETS = (2, 3)
+"""Those that are."""
 
 
 @dataclass(frozen=True)
@@ -244,9 +246,15 @@ def _learned(emulator: Emulator, specimens: Sequence[tuple[Slab, Inclusion]]) ->
         return []
     plan, points = emulator.plan, np.empty((len(specimens), 7))
     for number, (slab, inclusion) in enumerate(specimens):
-        away = sorted((abs(along) for along in inclusion.offset), reverse=True)
         s = float(contrast(np.array(inclusion.modulus / slab.modulus_kPa)))
-        points[number] = [inclusion.size, inclusion.depth, *away, slab.thickness_mm, slab.modulus_kPa, s]
+        points[number] = [
+            inclusion.size,
+            inclusion.depth,
+            *inclusion.offset,
+            slab.thickness_mm,
+            slab.modulus_kPa,
+            s,
+        ]
     inputs, n, ratios = features(plan, points), len(specimens), len(plan.ratios)
     linear = inputs[:, :-1]
     rise = emulator.rise(linear).reshape(n, ratios, -1) + emulator.finer(linear[:, CENTRED]).reshape(
@@ -270,9 +278,8 @@ def signals(
 ) -> list[tuple[Floats, Floats]]:
     """Rise (m, m) and tared displacement per mm (m, m, 3) on the grid, for weights (l,) of levels each."""
     learned = learned or _learned(emulator, [(slab, inclusion)])[0]
-    plan, (x, y) = emulator.plan, inclusion.offset
-    big, small, s = learned.point[2], learned.point[3], float(learned.point[-1])
-    geometry = Geometry(plan.probe, slab, replace(inclusion, offset=(float(big), float(small))))
+    plan, s = emulator.plan, float(learned.point[-1])
+    geometry = Geometry(plan.probe, slab, inclusion)
     along = lagrange(contrast(plan.ratios), s)
     onto = resample(geometry, plan.resolution, emulator.x)
     first = _on_grid(onto, along @ learned.rise, along @ learned.tared)
@@ -285,7 +292,7 @@ def signals(
             parts.append(_on_grid(onto, *(level[1:] @ more for more in learned.more)))
         whole = (sum(part) for part in zip(*parts, strict=True))
         rise, tared = (scale * part for scale, part in zip(scales, whole, strict=True))
-        found.append(unfold(rise, tared, (x, y)))
+        found.append((rise, tared))
     return found
 
 
@@ -321,9 +328,9 @@ def amplitudes(points: Floats, s: Floats | float) -> tuple[Floats, Floats]:
 
 
 def features(plan: Plan, points: Floats) -> Floats:
-    """Inputs of the regressions (n, 8), each about -1 to 1: size, depth of the centre, offsets, thickness,
-    tissue, nearness of the chest wall, and s, which only what finite strain adds depends on; points (n, 7) as
-    of `Plan.points`."""
+    """Inputs of the regressions (n, 8), each about -1 to 1, offsets to 2: size, depth of the centre, offsets,
+    thickness, tissue, nearness of the chest wall, and s, which only what finite strain adds depends on;
+    points (n, 7) as of `Plan.points`."""
     r = plan.ranges
     size, depth, x, y, thickness, tissue, s = points.T
     middle = (r.depth_mm[0] + r.size_mm[0] / 2, r.depth_mm[1] + r.size_mm[1] / 2)
@@ -333,7 +340,7 @@ def features(plan: Plan, points: Floats) -> Floats:
         return np.asarray((2 * np.log(values) - low - high) / (high - low))
 
     columns = [even(size, r.size_mm), even(depth + size / 2, middle)]
-    columns += [2 * offset / max(r.offset_mm, 1e-9) - 1 for offset in (x, y)]
+    columns += [2 * offset / max(r.offset_mm, 1e-9) for offset in (x, y)]
     columns += [even(thickness, r.thickness_mm), even(tissue, r.tissue_kPa)]
     columns.append(1.5 * np.log(2 * CLEARANCE / (thickness - size - depth)))
     columns.append((2 * s - sum(plan.signals)) / (plan.signals[1] - plan.signals[0]))
@@ -343,7 +350,7 @@ def features(plan: Plan, points: Floats) -> Floats:
 def resample(geometry: Geometry, res: Resolution, x: Floats) -> tuple[Floats, Floats]:
     """Matrices (m, n) that carry a field from a mesh's nodes to the grid, along x and along y."""
     along = lines(geometry, res)
-    return quadratic(along[0], x), quadratic(along[1], x)
+    return cubic(along[0], x), cubic(along[1], x)
 
 
 def lagrange(nodes: Floats, at: float) -> Floats:

@@ -37,13 +37,19 @@ _DRAWS = 4000
 
 
 @dataclass(frozen=True)
-class Task:
-    """One sample to answer, as a worker process takes it."""
+class Sample:
+    """A sample of a corpus for a model, as a worker process takes it, and where what comes of it goes."""
 
     model: str
     corpus: str
-    sample: int
+    number: int
     place: Path
+
+
+@dataclass(frozen=True)
+class Task(Sample):
+    """One to answer."""
+
     rendered: bool
     seed: int
 
@@ -159,10 +165,10 @@ def answer(task: Task) -> None:
     estimator, source = loaded(task.model), opened(task.corpus)
     plan = source.plan
     levels = levels_of(source, estimator)
-    values = level_names({k: v for k, v in plan.parameters(task.sample).items() if v is not None}, levels)
-    blank = plan.inclusion(task.sample) is None
+    values = level_names({k: v for k, v in plan.parameters(task.number).items() if v is not None}, levels)
+    blank = plan.inclusion(task.number) is None
     row: dict[str, Any] = {
-        "sample": task.sample,
+        "sample": task.number,
         "blank": blank,
         "truth": None if blank else [values[name] for name in NAMES],
         "rendered": task.rendered,
@@ -174,9 +180,9 @@ def answer(task: Task) -> None:
     near = None
     for frames in FRAMES:
         if frames == 1:
-            seen = stored(estimator, source, task.sample, levels)
+            seen = stored(estimator, source, task.number, levels)
         else:
-            seen = averaged(estimator, source, task.sample, levels, frames, task.seed)
+            seen = averaged(estimator, source, task.number, levels, frames, task.seed)
         told = estimator.features(seen[None])
         found: dict[str, Any] = {"presence": float(estimator.network.present(told, frames)[0])}
         row[str(frames)] = found

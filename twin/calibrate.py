@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,13 +21,14 @@ from scipy.ndimage import gaussian_filter
 
 from estimation.features import compress
 from twin import retake
-from twin.assessing import levels_of, loaded, one_thread, opened
+from twin.assessing import Sample, levels_of, loaded, one_thread, opened
 from twin.chain import BLOCK, whole_blocks
 from twin.complaint import DesignError, shown
 from twin.corpus import Corpus
 from twin.estimator import Estimator, Sight
 from twin.estimator_file import emulator_of, file_of, load_estimator, save_estimator
 from twin.fitting import inside, reachable
+from twin.frame import versions
 from twin.imagined import Brightness, check_field, mean_variance, pictures
 from twin.pooled import each
 from twin.rendered import rendered
@@ -41,16 +42,6 @@ LEAST = 12
 _SHARES = (1e-3, 3e-3, 0.01, 0.03, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.97)
 _COMMON = (0.01, 0.1, 0.25, 0.5, 0.75, 1.0)
 _NEAR = 1.5  # blocks over which squared differences are averaged: few samples tell each block's badly
-
-
-@dataclass(frozen=True)
-class Task:
-    """One sample to render as the model does, as a worker process takes it."""
-
-    model: str
-    corpus: str
-    sample: int
-    place: Path
 
 
 def calibrate(
@@ -77,6 +68,8 @@ def calibrate(
         In one line, for a sample that the model's emulator does not know.
     """
     source, estimator, place = Corpus(corpus), load_estimator(model), Path(f"{out}.safetensors")
+    if place.resolve() == file_of(model).resolve():
+        raise DesignError("--out", shown(str(out)), "another place than the model's own")
     if not estimator.traced:
         allowed = "one that was trained on a corpus with --traced"
         raise DesignError("MODEL", "one without learned light", allowed, source=str(model))
@@ -87,10 +80,11 @@ def calibrate(
     numbers = [int(n) for n in source.samples if source.plan.inclusion(int(n)) is not None][:samples]
     if len(numbers) < LEAST:
         raise DesignError("samples", shown(len(numbers)), f"{LEAST} or more inclusions", source=source.name)
-    key = hashlib.sha256((estimator.card["sha256"] + source.plan.head.samples.sha256).encode()).hexdigest()
+    made_of = (estimator.card["sha256"], source.plan.head.samples.sha256, versions())
+    key = hashlib.sha256(repr(made_of).encode()).hexdigest()
     folder = place.with_name(place.stem + ".parts") / f"rendered-{key[:16]}"
     folder.mkdir(parents=True, exist_ok=True)
-    tasks = [Task(str(model), str(corpus), number, folder / f"{number:06d}.npz") for number in numbers]
+    tasks = [Sample(str(model), str(corpus), number, folder / f"{number:06d}.npz") for number in numbers]
     left = [task for task in tasks if not task.place.is_file()]
 
     def share(count: int) -> None:
@@ -99,8 +93,7 @@ def calibrate(
     share(0)
     each(compare, left, workers or os.cpu_count() or 1, one_thread, share)
     values = [level_names(_values(source, number), levels) for number in numbers]
-    found = [np.load(task.place, allow_pickle=False) for task in tasks]
-    seen, own = (np.stack([one[name] for one in found]) for name in ("seen", "rendered"))
+    seen, own = (np.stack(each_of) for each_of in zip(*map(_read, tasks), strict=True))
     tared, off = own[:, :, 0] - own[:, :, 1], seen - own
     shares = [
         np.sqrt((off[:, :, 1] ** 2).mean(axis=(2, 3))) / own[:, :, 1].mean(axis=(2, 3)),
@@ -181,25 +174,30 @@ def shrunk(errors: Floats) -> Floats:
     return np.asarray(min(found, key=lambda one: one[0])[1])
 
 
+def _read(task: Sample) -> tuple[Single, Single]:
+    with np.load(task.place, allow_pickle=False) as file:
+        return file["seen"], file["rendered"]
+
+
 def _values(source: Corpus, number: int) -> dict[str, float]:
     return {k: v for k, v in source.plan.parameters(number).items() if v is not None}
 
 
-def compare(task: Task) -> None:
+def compare(task: Sample) -> None:
     """Keep what a corpus has of a sample, without noise, beside what the model renders; runs in a worker."""
     estimator, source = loaded(task.model), opened(task.corpus)
     levels = levels_of(source, estimator)
-    design = source.design_of(task.sample)
+    design = source.design_of(task.number)
 
     def coarse(layers: Single) -> Single:
         charge = retake.charge(design, layers, None, (1, 1)) / np.float32(design.camera.gain_e_per_dn)
         return retake.average(whole_blocks(charge), BLOCK)
 
     seen = [
-        [coarse(layers(task.sample, level)) for layers in (source.layers, source.reference_layers)]
+        [coarse(layers(task.number, level)) for layers in (source.layers, source.reference_layers)]
         for level in levels
     ]
-    values = level_names(_values(source, task.sample), levels)
+    values = level_names(_values(source, task.number), levels)
     own = rendered(estimator.chain, estimator.traced, values, threads=1)
     part = task.place.with_name(f".{task.place.name}.{os.getpid()}.part.npz")
     np.savez(part, seen=np.asarray(seen, np.float32), rendered=own)

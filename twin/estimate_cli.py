@@ -73,6 +73,14 @@ def _assess(arguments: argparse.Namespace) -> int:
     from twin.reporting import Reporter
 
     if arguments.curve:
+        for flag, given in (
+            ("--samples", arguments.samples),
+            ("--quick", arguments.quick),
+            ("--workers", arguments.workers),
+            ("--seed", arguments.seed),
+        ):
+            if given:
+                raise DesignError(flag, "it with --curve", "none of --samples, --quick, --workers, --seed")
         with Reporter() as report:
             told = learning_curve.curve(arguments.model, arguments.corpus, arguments.out, progress=report)
         print(learning_curve.words(told))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 import fem
 from twin.assess import LEAST_MM, stored
 from twin.assessing import levels_of
-from twin.complaint import DesignError
+from twin.complaint import DesignError, shown
 from twin.corpus import Corpus
 from twin.estimates import NAMES
 from twin.estimator import Estimator
@@ -26,7 +26,7 @@ from twin.fitting import fit
 from twin.report import BLUE, GREY, RED, panels, write_json
 from twin.train import Seen, gather, learn_light, level_names, of_levels
 
-RECORD, PICTURE = "curve.json", "curve.png"
+RECORD, PICTURE, KEPT = "curve.json", "curve.png", "curve.parts"
 SIZES = (40, 80, 134, 250, 500, 1000, 2000)
 TESTED = 60
 """Inclusions of `LEAST_MM` and more that are estimated, the last ones of the corpus."""
@@ -50,7 +50,15 @@ def curve(
     source, estimator = Corpus(corpus), load_estimator(model)
     levels = levels_of(source, estimator)
     folder = Path(out)
+    sizes_mm = [source.plan.parameters(int(n)).get("size_mm") or 0.0 for n in source.samples]
+    if sum(size >= LEAST_MM for size in sizes_mm) < tested or len(sizes_mm) < tested + SIZES[0]:
+        received = f"{len(sizes_mm)} samples"
+        allowed = f"{tested + SIZES[0]} or more, {tested} of them inclusions of {LEAST_MM:g} mm and more"
+        raise DesignError("samples", received, allowed, source=source.name)
+    if folder.exists() and not (folder / KEPT).is_file() and any(folder.iterdir()):
+        raise DesignError("--out", shown(str(folder)), "a new or empty folder")
     folder.mkdir(parents=True, exist_ok=True)
+    (folder / KEPT).touch()
     seen = gather(source, estimator.chain.emulator, folder, lambda share: progress("pictures", share))
     seen = Seen(
         seen.numbers,
@@ -65,9 +73,6 @@ def curve(
     last = np.flatnonzero(large)[-tested:]
     pool = np.arange(last[0])
     sizes = [size for size in SIZES if size <= len(pool)]
-    if len(last) < tested or not sizes:
-        received = f"{len(seen.numbers)} samples"
-        raise DesignError("samples", received, f"{tested + SIZES[0]} or more", source=source.name)
     truth = np.array([[seen.values[row][name] for name in NAMES] for row in last])
     pictures = np.stack([stored(estimator, source, int(n), levels) for n in seen.numbers[last]])
     told = estimator.features(pictures)
