@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 CELLS = 200  # of the grid of target points, per side
 DISC_POINTS = 96
 _NEWTON_STEPS = 7  # from a guess
-_NEWTON_AGAIN = 2  # from the disc's point before
+_NEWTON_AGAIN = 2, 3  # from the disc's point before, if there are so many points, or fewer
 _STRIPES = 9
 _GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 
@@ -89,7 +89,7 @@ def on(sensor: Sensor, basis: AngularBasis, ground: Array, points: int = DISC_PO
     target = [_float(values) for values in (x, y, *ground)]
 
     disc = _float(_disc_points(points))
-    end = dr.opaque(mi.UInt32, points)
+    end, steps = dr.opaque(mi.UInt32, points), _NEWTON_AGAIN[points < DISC_POINTS]
 
     index = dr.arange(mi.UInt32, n_led * CELLS * CELLS)
     led, point = index // (CELLS * CELLS), index % (CELLS * CELLS)
@@ -104,7 +104,7 @@ def on(sensor: Sensor, basis: AngularBasis, ground: Array, points: int = DISC_PO
         on_disc = dr.gather(mi.Point2f, disc, number)
         slopes = []
         for by_glass, begin in ((False, straight), (True, mirrored)):
-            flux, (cosine, d_x, d_y), slope = _arrives(sensor, source, on_disc, here, by_glass, begin)
+            flux, (cosine, d_x, d_y), slope = _arrives(sensor, source, on_disc, here, by_glass, begin, steps)
             weight = weights.at(cosine, d_x, d_y, flux > 0.0)
             total = tuple(sum_ + flux * w for sum_, w in zip(total, weight, strict=True))
             slopes.append(slope)
@@ -223,9 +223,11 @@ def _arrives(
     here: list[mi.Float],
     by_glass: bool,
     begin: mi.Vector2f,
+    steps: int,
 ) -> tuple[mi.Float, tuple[mi.Float, ...], mi.Vector2f]:
     """Irradiance, W/mm², at the targets from one point of each disc; the cosine of incidence there and the
-    direction along x and y; and the ray's slopes at the disc, found from those of a point nearby."""
+    direction along x and y; and the ray's slopes at the disc, found in so many steps from those of a point
+    nearby."""
     slope_x, slope_y = here[3:]
     guide, glass = sensor.guide, sensor.glass
     half, n, n_glass = guide.width_mm / 2, guide.refractive_index, glass.refractive_index
@@ -233,7 +235,7 @@ def _arrives(
     side_y, disc_z = source.along + source.radius * on_disc.x, source.z + source.radius * on_disc.y
     lit = way[0] > 1e-3
     slope = begin
-    for _ in range(_NEWTON_AGAIN):
+    for _ in range(steps):
         slope = _stepped(_follow(sensor, source, way, by_glass, slope), slope)
     path = _follow(sensor, source, way, by_glass, slope)
 

@@ -154,3 +154,15 @@ def test_sides_are_equivalent(variant: str) -> None:
     np.testing.assert_allclose(irradiance(other), irradiance(one)[:, ::-1], rtol=2e-4, atol=1e-12)
     top = dataclasses.replace(one, leds=(dataclasses.replace(led, side="+y"),))
     np.testing.assert_allclose(irradiance(top), irradiance(one).T, rtol=2e-4, atol=1e-12)
+
+
+def test_fewer_points_of_a_disc_find_the_same_rays(variant):
+    """They lie farther apart, so that each ray is farther from the one that its search begins with."""
+    from scenes.direct import on, relief
+    from scenes.irradiance import AngularBasis
+
+    everything = AngularBasis(np.ones((1, 2, 1)), np.ones((1, 2)))
+    sensor = paper_sensor("air")
+    ground = relief(sensor, flat(sensor.guide.width_mm, -0.1))
+    few, many = (on(sensor, everything, ground, points)[:, 0] for points in (32, 96))
+    assert np.abs(few - many).mean() < 0.01 * many.mean()

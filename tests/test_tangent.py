@@ -30,4 +30,4 @@ def test_a_picture_beside_is_the_picture(variant):
         renderer.render(bump(h), quality="preview", seed=5, traced=(traced,)).radiance for h in (0.4, 0.5)
     ]
     exact = each[1].astype(float) - each[0]
-    assert np.linalg.norm(slope - exact) < 0.02 * np.linalg.norm(exact)
+    assert np.linalg.norm(slope - exact) < 0.01 * np.linalg.norm(exact)
