@@ -11,13 +11,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fem.emulator import CENTRED, OFFSETS, Emulator, amplitudes, features, lagrange, resample, unfold
+from fem.emulator import CENTRED, Emulator, amplitudes, features, lagrange, resample
 from fem.emulator_errors import Errors
 from fem.regression import Regression, regress
 from fem.sampling import Plan, contrast, geometry_at
 from fem.solver import one_thread
 from fem.solving import KNOTS, STRETCHED, NotBuilt, Progress, knots, run, solved, tally
 from fem.surface import line_weights
+from fem.symmetry import unfold
 from fem.topology import Resolution
 
 Floats = NDArray[np.float64]
@@ -30,6 +31,7 @@ _FEWEST = {"sample": 30, "pair": 12, "stretch": 10}  # that a fit makes sense wi
 _NAMES = {"sample": "samples", "pair": "pairs of meshes", "stretch": "samples at finite strain"}
 _LEAST = 12  # samples at finite strain that the learning curve begins with
 _HELD = 3  # one in so many of the samples with both offsets is what the learning curve is measured on
+_IMAGES = 0.5  # how far beyond the symmetry planes images of the samples are learned, in largest offsets
 
 
 def build_emulator(
@@ -255,27 +257,28 @@ def _fit_kind(known: _Samples, lengths: Known | None) -> Pair:
     inputs, rise, tared = _with_images(known)
     first, second = lengths or (None, None)
     own = len(known.number)
-    return regress(inputs, rise, first, own, OFFSETS), regress(inputs, tared, second, own, OFFSETS)
+    return regress(inputs, rise, first, own), regress(inputs, tared, second, own)
 
 
 def _with_images(known: _Samples) -> tuple[Floats, Floats, Floats]:
-    """Inputs and flat fields of the samples, and of their images under the symmetries of the square: closed
-    under these, they make an answer that has them exactly, without a seam where images meet."""
+    """Inputs and flat fields of the samples, and of their images just beyond the planes of symmetry."""
     plan, columns = known.plan, known.inputs.shape[1]
+    margin = _IMAGES * plan.ranges.offset_mm
     found = [(known.inputs, _flat(known.rise), _flat(known.tared))]
     seen = [known.points[:, 2:4]]
     for turned, right, up in list(product((False, True), (1, -1), (1, -1)))[1:]:
         points = known.points.copy()
         points[:, 2:4] = known.points[:, (3, 2) if turned else (2, 3)] * (right, up)
-        new = np.ones(len(points), bool)
+        x, y = points[:, 2], points[:, 3]
+        near = (x > -margin) & (y > -margin) & (y < x + margin)
         for other in seen:  # one under the middle or beside it along x is its own image
-            new &= np.abs(points[:, 2:4] - other).max(axis=1) > 1e-9
+            near &= np.abs(points[:, 2:4] - other).max(axis=1) > 1e-9
         seen.append(points[:, 2:4])
-        if not new.any():
+        if not near.any():
             continue
         offset = (right, 2 * up) if turned else (2 * right, up)  # any that unfolds like this image
-        rise, tared = unfold(known.rise[new], known.tared[new], offset)
-        found.append((features(plan, points[new])[:, :columns], _flat(rise), _flat(tared)))
+        rise, tared = unfold(known.rise[near], known.tared[near], offset)
+        found.append((features(plan, points[near])[:, :columns], _flat(rise), _flat(tared)))
     inputs, rises, tareds = (np.vstack(part) for part in zip(*found, strict=True))
     return inputs, rises, tareds
 

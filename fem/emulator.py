@@ -26,6 +26,7 @@ from fem.model import Inclusion, Probe, Slab
 from fem.regression import Regression
 from fem.sampling import CLEARANCE, Plan, contrast, cubic, lines
 from fem.solving import knots
+from fem.symmetry import Image, images, unfold
 from fem.topology import Resolution
 
 Floats = NDArray[np.float64]
@@ -34,8 +35,6 @@ Floats = NDArray[np.float64]
 CENTRED = [0, 1, 4, 5, 6]
 """The inputs that are no offsets: all that the gain from a finer mesh depends on, in the mesh's
 coordinates."""
-OFFSETS = (2, 3)
-"""Those that are."""
 
 
 @dataclass(frozen=True)
@@ -244,29 +243,37 @@ def _learned(emulator: Emulator, specimens: Sequence[tuple[Slab, Inclusion]]) ->
     """Work the regressions out for all specimens at once."""
     if not specimens:
         return []
-    plan, points = emulator.plan, np.empty((len(specimens), 7))
+    plan, seen, points = emulator.plan, [], []
     for number, (slab, inclusion) in enumerate(specimens):
         s = float(contrast(np.array(inclusion.modulus / slab.modulus_kPa)))
-        points[number] = [
-            inclusion.size,
-            inclusion.depth,
-            *inclusion.offset,
-            slab.thickness_mm,
-            slab.modulus_kPa,
-            s,
-        ]
-    inputs, n, ratios = features(plan, points), len(specimens), len(plan.ratios)
+        for image in images(inclusion.offset, plan.ranges.offset_mm):
+            seen.append((number, image))
+            points.append(
+                [inclusion.size, inclusion.depth, *image.offset, slab.thickness_mm, slab.modulus_kPa, s]
+            )
+    rows = np.array(points)
+    inputs = features(plan, rows)
     linear = inputs[:, :-1]
-    rise = emulator.rise(linear).reshape(n, ratios, -1) + emulator.finer(linear[:, CENTRED]).reshape(
-        n, ratios, -1
-    )
-    tared = emulator.tared(linear).reshape(n, ratios, -1)
-    more: Sequence[tuple[Floats, Floats] | None] = [None] * n
+    rise = emulator.rise(linear) + emulator.finer(linear[:, CENTRED])
+    small = _blended(seen, rise, emulator.tared(linear), len(plan.ratios))
+    more: Sequence[tuple[Floats, Floats] | None] = [None] * len(small)
     if emulator.rise_more is not None and emulator.tared_more is not None:
-        beyond, ends = (emulator.rise_more, emulator.tared_more), len(plan.levels) - 1
-        both = (regression(inputs).reshape(n, ends, -1) for regression in beyond)
-        more = list(zip(*both, strict=True))
-    return [_Learned(*parts) for parts in zip(points, rise, tared, more, strict=True)]
+        more = _blended(seen, emulator.rise_more(inputs), emulator.tared_more(inputs), len(plan.levels) - 1)
+    first = np.unique([number for number, _ in seen], return_index=True)[1]
+    return [_Learned(*parts) for parts in zip(rows[first], *zip(*small, strict=True), more, strict=True)]
+
+
+def _blended(
+    seen: Sequence[tuple[int, Image]], rise: Floats, tared: Floats, cases: int
+) -> list[tuple[Floats, Floats]]:
+    """Rise and tared displacement of each specimen (cases, ...) from those of its images, (n, ...)."""
+    side = round((rise.shape[1] / cases) ** 0.5)
+    found: dict[int, list[Floats | float]] = {}
+    for (number, image), one, other in zip(seen, rise, tared, strict=True):
+        parts = unfold(one.reshape(cases, side, side), other.reshape(cases, side, side, 3), image.turn)
+        total = found.setdefault(number, [0.0, 0.0])
+        total[:] = [before + image.share * part for before, part in zip(total, parts, strict=True)]
+    return [(np.reshape(r, (cases, -1)), np.reshape(t, (cases, -1))) for r, t in found.values()]
 
 
 def signals(
@@ -305,19 +312,6 @@ def _on_grid(onto: tuple[Floats, Floats], rise: Floats, tared: Floats) -> tuple[
     )
 
 
-def unfold(rise: Floats, tared: Floats, offset: tuple[float, float]) -> tuple[Floats, Floats]:
-    """Fields (..., m, m) and (..., m, m, 3) of an offset x >= y >= 0 as they are at one of its eight
-    images."""
-    x, y = offset
-    if abs(y) > abs(x):
-        rise, tared = rise.swapaxes(-1, -2), tared.swapaxes(-2, -3)[..., [1, 0, 2]]
-    if x < 0:
-        rise, tared = rise[..., ::-1, :], tared[..., ::-1, :, :] * [-1.0, 1.0, 1.0]
-    if y < 0:
-        rise, tared = rise[..., ::-1], tared[..., ::-1, :] * [1.0, -1.0, 1.0]
-    return rise, tared
-
-
 def amplitudes(points: Floats, s: Floats | float) -> tuple[Floats, Floats]:
     """What the rise and the tared displacement per mm are divided by: s d³ / z², a sphere's far field with
     z its centre's depth, times one length; the latter also times the tissue's modulus over its thickness,
@@ -328,9 +322,9 @@ def amplitudes(points: Floats, s: Floats | float) -> tuple[Floats, Floats]:
 
 
 def features(plan: Plan, points: Floats) -> Floats:
-    """Inputs of the regressions (n, 8), each about -1 to 1, offsets to 2: size, depth of the centre, offsets,
-    thickness, tissue, nearness of the chest wall, and s, which only what finite strain adds depends on;
-    points (n, 7) as of `Plan.points`."""
+    """Inputs of the regressions (n, 8), each about -1 to 1: size, depth of the centre, offsets, thickness,
+    tissue, nearness of the chest wall, and s, which only what finite strain adds depends on; points (n, 7) as
+    of `Plan.points`."""
     r = plan.ranges
     size, depth, x, y, thickness, tissue, s = points.T
     middle = (r.depth_mm[0] + r.size_mm[0] / 2, r.depth_mm[1] + r.size_mm[1] / 2)
@@ -340,7 +334,7 @@ def features(plan: Plan, points: Floats) -> Floats:
         return np.asarray((2 * np.log(values) - low - high) / (high - low))
 
     columns = [even(size, r.size_mm), even(depth + size / 2, middle)]
-    columns += [2 * offset / max(r.offset_mm, 1e-9) for offset in (x, y)]
+    columns += [2 * offset / max(r.offset_mm, 1e-9) - 1 for offset in (x, y)]
     columns += [even(thickness, r.thickness_mm), even(tissue, r.tissue_kPa)]
     columns.append(1.5 * np.log(2 * CLEARANCE / (thickness - size - depth)))
     columns.append((2 * s - sum(plan.signals)) / (plan.signals[1] - plan.signals[0]))

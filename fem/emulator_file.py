@@ -22,7 +22,7 @@ from fem.solving import KNOTS
 
 Floats = NDArray[np.float64]
 
-_FORMAT = 4
+_FORMAT = 3
 _LARGEST = 512 * 2**20  # bytes of all arrays
 _REGRESSIONS = ("rise", "tared", "finer")
 _MORE = ("rise_more", "tared_more")  # that finite strain has besides
@@ -143,11 +143,10 @@ def _shapes_of(arrays: dict[str, NDArray[Any]], name: str, q: int, values: int) 
     samples, modes = len(arrays[f"{name}.inputs"]), len(arrays[f"{name}.modes"])
     if not ((arrays[f"{name}.lengths"] > 0).all() and (arrays[f"{name}.noise"] > 0).all()):
         raise ValueError(f"{name}: lengths and noise are not positive")
-    parts = len(groups(arrays[f"{name}.modes"]))
     shapes = {
         "inputs": (samples, q),
-        "lengths": (parts, q),
-        "noise": (parts,),
+        "lengths": (len(groups(modes)), q),
+        "noise": (len(groups(modes)),),
         "mean": (values,),
         "modes": (modes, values),
     }

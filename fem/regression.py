@@ -4,10 +4,6 @@ A field (m values) of the inputs is its mean and a few modes, whose coefficients
 a linear trend and squared-exponential covariances (Rasmussen and Williams 2006, sections 2.2, 2.7 and 5.4.1;
 [rasmussen2006]). Leading modes have lengths of their own, the others share some; they maximise the marginal
 likelihood, the trend and each mode's variance are solved for.
-
-Samples that are closed under a group of symmetries, which turns inputs and fields together, make an answer
-that is exactly symmetric, as long as the covariance is: modes that a symmetry mixes have the same spread, and
-must share their lengths.
 """
 
 from __future__ import annotations
@@ -16,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, cholesky, eigh, solve_triangular
+from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 from scipy.optimize import minimize
 
 Floats = NDArray[np.float64]
@@ -24,7 +20,6 @@ Floats = NDArray[np.float64]
 _MODES = 80  # at most
 _TINY = 1e-9  # share of the variance that may be left out
 _GROUPS = (0, 1, 2, 4, 8, 16)  # first modes of groups that share their lengths
-_ALIKE = 1e-4  # relative difference of the spreads of two modes that a symmetry mixes, at most
 _LEADING = 16  # modes of a group that the lengths are found from
 _ENOUGH = 250  # samples that the lengths are found from
 _BOUNDS = [np.log(0.2), np.log(60.0)], [np.log(1e-9), np.log(1e-1)]  # of lengths and noise
@@ -39,8 +34,8 @@ class Regression:
     inputs
         (n, q) of the samples, scaled by whoever asks to about -1 ... 1.
     lengths, noise
-        Of the covariance of each of the `groups` of modes: (g, q), and variance of the noise over that of the
-        signal, (g,).
+        Of the covariance of each group of modes, which begin at modes `_GROUPS`: (g, q), and variance of the
+        noise over that of the signal, (g,).
     mean, modes
         Of the field: (m,), (k, m).
     trend, weights
@@ -58,23 +53,15 @@ class Regression:
     def __call__(self, inputs: Floats) -> Floats:
         """Fields (p, m) at inputs (p, q)."""
         found = _trend(inputs) @ self.trend
-        for group, scales in zip(groups(self.modes), self.lengths, strict=True):
+        for group, scales in zip(groups(len(self.modes)), self.lengths, strict=True):
             found[:, group] += _covariance(inputs / scales, self.inputs / scales) @ self.weights[:, group]
         return np.asarray(self.mean + found @ self.modes)
 
 
-def groups(modes: Floats) -> list[slice]:
-    """Which of the modes (k, m) share their lengths."""
-    spread = np.linalg.norm(modes, axis=1)
-    starts = sorted({_whole(spread, start) for start in _GROUPS if start < len(spread)} - {len(spread)})
-    return [slice(a, b) for a, b in zip(starts, [*starts[1:], len(spread)], strict=True)]
-
-
-def _whole(spread: Floats, start: int) -> int:
-    """The first place from `start` on that does not part modes that a symmetry mixes."""
-    while 0 < start < len(spread) and spread[start] > (1 - _ALIKE) * spread[start - 1]:
-        start += 1
-    return start
+def groups(modes: int) -> list[slice]:
+    """The modes of each group that shares its lengths."""
+    starts = [start for start in _GROUPS if start < modes]
+    return [slice(a, b) for a, b in zip(starts, [*starts[1:], modes], strict=True)]
 
 
 def _covariance(a: Floats, b: Floats) -> Floats:
@@ -89,33 +76,23 @@ def _trend(inputs: Floats) -> Floats:
 def principal(fields: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     """Mean (m,), modes (k, m), coefficients (n, k) of unit variance and each mode's share of the spread
     (k,)."""
-    mean, n = fields.mean(axis=0), len(fields)
-    off = fields - mean
-    most = min(_MODES + 1, n)
-    squares, left = eigh(off @ off.T, subset_by_index=(n - most, n - 1))  # far fewer samples than values
-    squares, left = np.maximum(squares[::-1], 0.0), left[:, ::-1]
-    total = (off**2).sum() or 1.0  # fields that are all the same have none
-    left_out = 1 - np.cumsum(squares) / total
-    k = min(_MODES, int(np.searchsorted(-left_out, -_TINY)) + 1, max(1, n - 8))
-    size = np.sqrt(squares)
-    k = _whole(size[: max(1, n - 8)], k) if squares[k - 1] > 0 else k
-    root = np.sqrt(n)
-    return mean, left[:, :k].T @ off / root, left[:, :k] * root, size[:k] / (size[:k].sum() or 1.0)
+    mean = fields.mean(axis=0)
+    left, size, modes = np.linalg.svd(fields - mean, full_matrices=False)
+    total = (size**2).sum() or 1.0  # fields that are all the same have none
+    left_out = 1 - np.cumsum(size**2) / total
+    k = min(_MODES, int(np.searchsorted(-left_out, -_TINY)) + 1, max(1, len(fields) - 8))
+    root = np.sqrt(len(fields))
+    return mean, modes[:k] * size[:k, None] / root, left[:, :k] * root, size[:k] / (size[:k].sum() or 1.0)
 
 
-def lengths(
-    inputs: Floats, values: Floats, share: Floats, tied: tuple[int, ...] = ()
-) -> tuple[Floats, Floats]:
-    """Most likely lengths (q,) and noise () for coefficients (n, k) that matter by their share (k,); those of
-    tied inputs are equal."""
+def lengths(inputs: Floats, values: Floats, share: Floats) -> tuple[Floats, Floats]:
+    """Most likely lengths (q,) and noise () for coefficients (n, k) that matter by their share (k,)."""
     inputs, values, share = inputs[:_ENOUGH], values[:_ENOUGH, :_LEADING], share[:_LEADING]
     trend, q = _trend(inputs), inputs.shape[1]
     free = len(inputs) - trend.shape[1]
-    which = np.arange(q)  # of the numbers that are looked for is each input's length
-    which[list(tied)] = min(tied, default=0)
 
     def unlikely(logs: Floats) -> float:
-        scaled = inputs / np.exp(logs[which])
+        scaled = inputs / np.exp(logs[:q])
         covariance = _covariance(scaled, scaled) + np.exp(logs[q]) * np.eye(len(inputs))
         try:
             root = cholesky(covariance, lower=True)
@@ -131,7 +108,7 @@ def lengths(
 
     start = np.append(np.full(q, np.log(3.0)), np.log(1e-5))
     found = minimize(unlikely, start, method="L-BFGS-B", bounds=[_BOUNDS[0]] * q + [_BOUNDS[1]])
-    return np.exp(found.x[which]), np.exp(found.x[q])
+    return np.exp(found.x[:q]), np.exp(found.x[q])
 
 
 def regress(
@@ -139,7 +116,6 @@ def regress(
     fields: Floats,
     known: tuple[Floats, Floats] | None = None,
     own: int | None = None,
-    tied: tuple[int, ...] = (),
 ) -> Regression:
     """Fit fields (n, m) at inputs (n, q).
 
@@ -150,16 +126,14 @@ def regress(
     own
         From how many of the first samples they are found, all by default. Images of samples, which repeat the
         numbers of others, would look like proof of no noise.
-    tied
-        Inputs that a symmetry exchanges, whose lengths are equal.
     """
     mean, modes, values, share = principal(fields)
-    trend, parts = _trend(inputs), groups(modes)
+    trend, parts = _trend(inputs), groups(len(modes))
     if known is None:
-        found = [lengths(inputs[:own], values[:own, part], share[part], tied) for part in parts]
+        found = [lengths(inputs[:own], values[:own, part], share[part]) for part in parts]
         scales, noise = np.stack([f[0] for f in found]), np.array([f[1] for f in found])
-    else:  # modes may have come out in other groups
-        scales, noise = (values[np.minimum(range(len(parts)), len(values) - 1)] for values in known)
+    else:  # fewer modes may have come out
+        scales, noise = (values[: len(parts)] for values in known)
     line, weights = np.empty((trend.shape[1], len(modes))), np.empty(values.shape)
     for part, scale, some in zip(parts, scales, noise, strict=True):
         scaled = inputs / scale

@@ -12,12 +12,13 @@ from numpy.lib.format import write_array
 
 import fem
 from fem.emulating import build_emulator, fit
-from fem.emulator import Emulator, lagrange, resample, signals, unfold
+from fem.emulator import Emulator, lagrange, resample, signals
 from fem.emulator_file import NotAnEmulator, load_emulator, save_emulator
 from fem.emulator_limits import check
 from fem.regression import Regression, regress
 from fem.sampling import Plan, Ranges, background, cubic, geometry_at, solve
 from fem.solving import knots
+from fem.symmetry import unfold
 from fem.topology import Resolution
 
 PROBE = fem.Probe(20.0, (fem.Layer(6.0, 60.0),))
