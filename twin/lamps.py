@@ -169,13 +169,15 @@ def _told(picture: Picture, settings: Floats, sequential: bool) -> Floats:
         return np.asarray(sum(_told(picture, one, False) for one in alone))
     lit, r, n = picture.slopes.shape
     slopes, table = picture.slopes.reshape(lit, r * n), _Weights.of(picture.noise, picture.top)
-    found = np.empty((len(settings), r, r), np.float32)
+    found = np.empty((len(settings), r, r))
     for some in _parts(len(settings), r * n):
         now = np.column_stack([settings[some], np.ones(some.stop - some.start)]).astype(np.float32)
         jacobian = (now @ slopes).reshape(-1, r, n)
         jacobian *= table(now[:, :-1] @ picture.layers + picture.dark)[:, None]
-        np.matmul(jacobian, jacobian.transpose(0, 2, 1), out=found[some])
-    return np.asarray(picture.mixing @ found.astype(np.float64) @ picture.mixing.T)
+        # single precision would lose what other settings tell least of: variances could come out negative
+        double = jacobian.astype(np.float64)
+        np.matmul(double, double.transpose(0, 2, 1), out=found[some])
+    return np.asarray(picture.mixing @ found @ picture.mixing.T)
 
 
 def bounds(
