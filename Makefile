@@ -1,7 +1,7 @@
 # Two commands do everything on a fresh Debian or Ubuntu machine with Python 3.11 or newer, root or not:
 #   make demo    set up, press a probe on an inclusion, show where the pictures are
 #   make test    set up, run the tests
-# Set-up goes into .venv, .llvm and .ccx of this folder, and is done once; delete them (make clean) to do it again.
+# Set-up goes into .venv, .llvm, .ccx and .chromium of this folder, and is done once; delete them (make clean) to do it again.
 
 PYTHON ?= python3
 # Where pip looks for torch, if not in its usual index. PyPI's own torch for Linux brings CUDA along (several GB);
@@ -42,7 +42,7 @@ $(READY): pyproject.toml constraints.txt | $(BIN)/pip
 	$(BIN)/python -m pip install -q -c constraints.txt $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) torch==2.13.0
 	PYTHONWARNINGS=ignore $(BIN)/python -m pip install -q -c constraints.txt -e ".[test]"
 	$(BIN)/python -m scenes.llvm_fetch .llvm
-	-$(BIN)/python tests/ccx_fetch.py .ccx
+	-$(BIN)/python tests/debian_fetch.py
 	@touch $@
 
 # A fresh Debian has Python without ensurepip (it is in python3-venv): there pip comes from Debian's package of it,
@@ -66,5 +66,5 @@ $(BIN)/pip:
 	  echo "Python cannot make an environment here: sudo apt-get install python3-venv" >&2; exit 1; }
 
 clean:
-	rm -rf .venv .llvm .ccx build dist out *.egg-info .pytest_cache .mypy_cache .ruff_cache
+	rm -rf .venv .llvm .ccx .chromium build dist out *.egg-info .pytest_cache .mypy_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,27 +1,21 @@
-"""Pages as a browser shows them: headless Chromium without network, where the machine has one."""
+"""Pages as a browser shows them: headless Chromium without network."""
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 from pathlib import Path
 
 import pytest
+from debian_fetch import CHROMIUM
 
-NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome", "chromium-headless-shell")
 LAPTOP = (1366, 768)
-
-
-def found() -> str | None:
-    """The browser, None where there is none."""
-    return next(filter(None, map(shutil.which, NAMES)), None)
 
 
 def run(page: Path, *flags: str, at: str = "") -> tuple[str, list[str]]:
     """Open a page from its file; return what the browser prints, and what the page said on its console."""
-    browser = found()
+    browser = CHROMIUM.find()
     if browser is None:
-        pytest.skip("no Chromium on this machine (Debian: apt-get install chromium)")
+        pytest.skip("Chromium is neither installed nor in .chromium: make setup")
     done = subprocess.run(
         [
             browser,

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pyvista as pv
-from ccx_fetch import find
+from debian_fetch import CCX
 from numpy.typing import NDArray
 
 import fem
@@ -55,7 +55,7 @@ def run(deck: Path, timeout: float = 3600) -> Results:
     """Solve a deck in its own folder, in one thread."""
     names = ("OMP_NUM_THREADS", "CCX_NPROC_STIFFNESS", "CCX_NPROC_RESULTS", "CCX_NPROC_EQUATION_SOLVER")
     env = os.environ | dict.fromkeys(names, "1")
-    program = find()
+    program = CCX.find()
     assert program is not None
     start = time.perf_counter()
     done = subprocess.run(

@@ -7,7 +7,7 @@ from pathlib import Path
 import ccx_runner
 import numpy as np
 import pytest
-from ccx_fetch import find
+from debian_fetch import CCX
 
 import fem
 from fem import ccx
@@ -16,7 +16,7 @@ from fem.model import Pose
 from fem.topology import Resolution
 
 needs_ccx = pytest.mark.skipif(
-    find() is None, reason="CalculiX (ccx) is neither installed nor in .ccx: make setup"
+    CCX.find() is None, reason="CalculiX (ccx) is neither installed nor in .ccx: make setup"
 )
 
 PROBE = fem.Probe(25, (fem.Layer(2, 27), fem.Layer(3, 61), fem.Layer(5, 156)))

@@ -115,7 +115,7 @@ def test_map_writes_its_files_and_says_three_lines(
     assert len(table) == 6 and np.isfinite(table.loc[table["kind"] == "tared", "slope"]).any()
     assert not {p.name for p in (tmp_path / "out").iterdir()} ^ mapping_report.FILES
     assert "<img" in (tmp_path / "out" / "report.html").read_text()
-    if browser.found():  # opens from its file, without network, and has nothing to complain of
+    if browser.CHROMIUM.find():  # opens from its file, without network, and has nothing to complain of
         assert browser.screenshot(tmp_path / "out" / "report.html", tmp_path / "map.png") == []
 
 

@@ -201,7 +201,7 @@ def test_replicate_writes_the_papers_figures_and_the_same_tables_again(
     page = (tmp_path / "a" / "report.html").read_text()
     for words in ("1.51", "2.45", "31.3", "could not be checked", "Fig. 3(c)", "Fig. 4", "Fig. 5", "guessed"):
         assert words in page, words
-    if browser.found():  # opens from its file, without network, and has nothing to complain of
+    if browser.CHROMIUM.find():  # opens from its file, without network, and has nothing to complain of
         assert browser.screenshot(tmp_path / "a" / "report.html", tmp_path / "replica.png") == []
     rows = list(csv.DictReader((tmp_path / "a" / "errors.csv").read_text().splitlines()))
     printed = next(row for row in rows if row["method"] == "paper-printed" and row["phantoms"] == "all")

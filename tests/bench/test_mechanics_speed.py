@@ -14,7 +14,7 @@ from pathlib import Path
 import ccx_runner
 import numpy as np
 import pytest
-from ccx_fetch import find
+from debian_fetch import CCX
 from lone_press import BALL, LEVEL_MM, PROBE, SLAB
 from test_fem_convergence import REFINED
 
@@ -113,7 +113,7 @@ def ladders(expected: float, tmp_path_factory: pytest.TempPathFactory) -> dict[s
         name: lambda res, name=name: lone(name, res)  # type: ignore[misc]
         for name in ("ours", "P2", "P2 ordered", "P2/P1")
     }
-    if find() is None:
+    if CCX.find() is None:
         print("\nCalculiX (ccx) is neither installed nor in .ccx: its row is left out")
     else:
         methods["CalculiX"] = lambda res: calculix(folder, res)
@@ -204,7 +204,7 @@ def test_finite_strain(tmp_path: Path) -> None:
         f"\nfinite strain, 1, 2, 3 mm, standard: {ours:.1f} s, a linear press {linear:.1f} s, "
         f"ratio {ours / linear:.1f} (goal at most {FINITE_GOAL:.0f})"
     )
-    if find() is None:
+    if CCX.find() is None:
         print("CalculiX (ccx) is neither installed nor in .ccx: its row is left out")
         return
     for levels in ([1.0, 2.0, 3.0], [1.0, 2.0]):
