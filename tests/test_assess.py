@@ -3,11 +3,12 @@
 import json
 from typing import Any
 
+import browser
 import numpy as np
 import pytest
 
 from estimation.scalars import scalars
-from twin import ablation, assessing
+from twin import ablation, assessing, assessing_report, learning_curve
 from twin.assess import figures, summed_up
 from twin.assessing_figure import draw
 from twin.assessment import answered, record_of, words
@@ -73,6 +74,31 @@ def test_the_record_tells_all_that_the_words_say(tmp_path: Any) -> None:
         {frames: answered(rows(), frames, "rendered") for frames in (1, 100)}, RANGES, 5.0, tmp_path / "a.png"
     )
     assert (tmp_path / "a.png").stat().st_size > 20_000
+
+
+def test_the_page_holds_the_tables_and_a_learning_curve(tmp_path: Any) -> None:
+    """All in one file, of whatever lies in the folder; a browser has nothing to complain of."""
+    curve = {"corpus": "made up", "model": "m", "tested": 60, "parameters": [], "bound": [0.05, 0.03, 12.0]}
+    curve["curve"] = [{"samples": n, "rmse": [4.0 / n, 3.0 / n, 900.0 / n]} for n in (40, 80)]
+    (tmp_path / "curve.json").write_text(json.dumps(curve))
+    learning_curve._draw(curve, tmp_path / "curve.png")
+    alone = assessing_report.write(tmp_path).read_text(encoding="utf-8")
+    assert "0.0375" in alone and "Errors and the bound" not in alone
+    record = record_of(rows(), RANGES, True) | {"corpus_name": "made <up>"}
+    (tmp_path / "assessment.json").write_text(json.dumps(record))
+    drawn = {frames: answered(rows(), frames, "rendered") for frames in (1, 100)}
+    draw(drawn, RANGES, 5.0, tmp_path / "assessment.png")
+    page = assessing_report.write(tmp_path)
+    text = page.read_text(encoding="utf-8")
+    for told in (
+        "35 inclusions and 5 blanks of made &lt;up&gt;",
+        "times the bound",
+        "ideal observer",
+        "0.0375",
+    ):
+        assert told in text
+    if browser.CHROMIUM.find():
+        assert browser.screenshot(page, tmp_path / "page.png") == []
 
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path: Any) -> None:

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import fem
-from twin import ablation
+from twin import ablation, assessing_report
 from twin.assess import FRAMES, averaged, stored, summed_up
 from twin.assessment import METHODS, SHORT, answered, record_of
 from twin.complaint import DesignError, shown
@@ -32,7 +32,9 @@ from twin.pooled import each
 from twin.report import write_json
 from twin.train import TEST, level_names
 
-SAMPLES, RECORD, PICTURE = "samples", "assessment.json", "assessment.png"
+SAMPLES, RECORD, PICTURE = "samples", assessing_report.ASSESSMENT, assessing_report.ASSESSED
+KEPT = "curve.parts"
+"""What a folder with a learning curve holds."""
 _DRAWS = 4000
 
 
@@ -65,7 +67,7 @@ def assess(
     seed: int = 0,
     progress: Callable[[str, float], None] = lambda stage, share: None,
 ) -> dict[str, Any]:
-    """Answer samples of a corpus, write `RECORD` and `PICTURE` into a folder, and return the record.
+    """Answer samples of a corpus, write `RECORD`, `PICTURE` and a page into a folder, and return the record.
 
     Parameters
     ----------
@@ -108,6 +110,7 @@ def assess(
     tissue_kPa = estimator.chain.design.specimen.modulus_kPa
     drawn = {frames: answered(rows, frames, METHODS[rendered]) for frames in FRAMES}
     draw(drawn, estimator.prior.ranges, tissue_kPa, folder / PICTURE)
+    assessing_report.write(folder)
     return record
 
 
@@ -127,6 +130,13 @@ def levels_of(source: Corpus, estimator: Estimator) -> list[int]:
     return [there.index(depth) for depth in depths]
 
 
+def free(folder: Path) -> bool:
+    """Whether a folder is empty, or holds what `twin assess` made: estimates or a learning curve."""
+    if not folder.exists() or not any(folder.iterdir()):
+        return True
+    return any((folder / name).is_file() for name in (f"{SAMPLES}/head.json", KEPT))
+
+
 def _claim(folder: Path, told: Mapping[str, Any]) -> None:
     """Make the folder, or go on with one that was made for the same model, corpus and seed."""
     head = folder / SAMPLES / "head.json"
@@ -135,7 +145,7 @@ def _claim(folder: Path, told: Mapping[str, Any]) -> None:
             allowed = "a new folder, or that of the same model, corpus and seed"
             raise DesignError("--out", shown(str(folder)), allowed)
         return
-    if folder.exists() and any(folder.iterdir()):
+    if not free(folder):
         raise DesignError("--out", shown(str(folder)), "a new or empty folder")
     head.parent.mkdir(parents=True, exist_ok=True)
     write_json(head, told)

@@ -20,15 +20,16 @@ examples:
 _ASSESS = """\
 Answer every inclusion of a corpus that a model has not seen (its group named test, else all), from one
 exposure and from the mean of 100, by the network and refined by rendering, and compare with the truth and
-with the smallest error that the pictures allow. Writes assessment.json and assessment.png. A corpus of the
-same sensor made by full solves or with other light tells what a mismatch costs. Half a minute a sample and
-core; every answer is kept: the same command goes on, also after Ctrl-C.
+with the smallest error that the pictures allow. Writes report.html, assessment.json and assessment.png. A
+corpus of the same sensor made by full solves or with other light tells what a mismatch costs. Half a minute a
+sample and core; every answer is kept: the same command goes on, also after Ctrl-C. With --curve, a learning
+curve of the light map, which the report of the same DIR shows, too.
 
 examples:
   twin assess models/tsis corpora/pictures --out assessed
   twin assess models/tsis corpora/pictures --quick --out quick
   twin assess models/tsis corpora/solved --samples 20 --out mismatch
-  twin assess models/tsis corpora/pictures --curve --out curve
+  twin assess models/tsis corpora/pictures --curve --out assessed
 """
 
 _CALIBRATE = """\

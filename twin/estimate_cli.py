@@ -69,7 +69,7 @@ def _assess(arguments: argparse.Namespace) -> int:
     for flag, value in (("--samples", arguments.samples), ("--workers", arguments.workers)):
         if value == 0:
             raise DesignError(flag, "0", "an integer >= 1")
-    from twin import assessing, assessment, learning_curve
+    from twin import assessing, assessing_report, assessment, learning_curve
     from twin.reporting import Reporter
 
     if arguments.curve:
@@ -84,7 +84,7 @@ def _assess(arguments: argparse.Namespace) -> int:
         with Reporter() as report:
             told = learning_curve.curve(arguments.model, arguments.corpus, arguments.out, progress=report)
         print(learning_curve.words(told))
-        print(f"look at: {Path(arguments.out) / learning_curve.PICTURE}")
+        print(f"look at: {Path(arguments.out) / assessing_report.REPORT}")
         return 0
     with Reporter() as report:
         record = assessing.assess(
@@ -98,7 +98,7 @@ def _assess(arguments: argparse.Namespace) -> int:
             progress=report,
         )
     print(assessment.words(record))
-    print(f"look at: {Path(arguments.out) / assessing.PICTURE}")
+    print(f"look at: {Path(arguments.out) / assessing_report.REPORT}")
     return 0
 
 

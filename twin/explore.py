@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 import json
 import os
+import re
 import shutil
 import uuid
 import warnings
@@ -220,16 +221,8 @@ def opened(exploration: Exploration) -> optuna.Study:
     except Exception as error:  # SQLAlchemy's and its drivers' many ways to say no
         reason = " ".join(str(error).split())[:120]
         allowed = "a URL that SQLAlchemy opens (sqlite:///FILE, postgresql://..., mysql://...)"
-        raise DesignError("--storage", f"{_without_password(exploration.url)} ({reason})", allowed) from None
-
-
-def _without_password(url: str) -> str:
-    import sqlalchemy
-
-    try:
-        return sqlalchemy.make_url(url).render_as_string(hide_password=True)
-    except sqlalchemy.exc.ArgumentError:
-        return shown(url)
+        place = re.sub("(?<=:)[^:/@]+(?=@)", "***", exploration.url)  # without the password
+        raise DesignError("--storage", f"{place} ({reason})", allowed) from None
 
 
 def work(

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 import fem
+from twin import assessing_report
 from twin.assess import LEAST_MM, stored
-from twin.assessing import levels_of
+from twin.assessing import KEPT, free, levels_of
 from twin.complaint import DesignError, shown
 from twin.corpus import Corpus
 from twin.estimates import NAMES
@@ -26,7 +27,7 @@ from twin.fitting import fit
 from twin.report import BLUE, GREY, RED, panels, write_json
 from twin.train import Seen, gather, learn_light, level_names, of_levels
 
-RECORD, PICTURE, KEPT = "curve.json", "curve.png", "curve.parts"
+RECORD, PICTURE = assessing_report.CURVE, assessing_report.CURVED
 SIZES = (40, 80, 134, 250, 500, 1000, 2000)
 TESTED = 60
 """Inclusions of `LEAST_MM` and more that are estimated, the last ones of the corpus."""
@@ -40,7 +41,7 @@ def curve(
     tested: int = TESTED,
     progress: Callable[[str, float], None] = lambda stage, share: None,
 ) -> dict[str, Any]:
-    """Write `RECORD` and `PICTURE` into a folder, and return the record.
+    """Write `RECORD`, `PICTURE` and a page into a folder, and return the record.
 
     Raises
     ------
@@ -55,8 +56,8 @@ def curve(
         received = f"{len(sizes_mm)} samples"
         allowed = f"{tested + SIZES[0]} or more, {tested} of them inclusions of {LEAST_MM:g} mm and more"
         raise DesignError("samples", received, allowed, source=source.name)
-    if folder.exists() and not (folder / KEPT).is_file() and any(folder.iterdir()):
-        raise DesignError("--out", shown(str(folder)), "a new or empty folder")
+    if not free(folder):
+        raise DesignError("--out", shown(str(folder)), "a new or empty folder, or that of an assessment")
     folder.mkdir(parents=True, exist_ok=True)
     (folder / KEPT).touch()
     seen = gather(source, estimator.chain.emulator, folder, lambda share: progress("pictures", share))
@@ -101,6 +102,7 @@ def curve(
     }
     write_json(folder / RECORD, record)
     _draw(record, folder / PICTURE)
+    assessing_report.write(folder)
     return record
 
 

@@ -116,7 +116,12 @@ class Page:
 
     def figure(self, figure: Figure, caption: str, *, pixels: bool = False) -> Page:
         """Add a figure as wide as the page; as pixels where its parts are many."""
-        kind, made = ("png", png(figure)) if pixels else ("svg+xml", svg(figure))
+        if pixels:
+            return self.picture(png(figure), caption)
+        return self.picture(svg(figure), caption, "svg+xml")
+
+    def picture(self, made: bytes, caption: str, kind: str = "png") -> Page:
+        """Add a picture of a file's bytes, as wide as the page."""
         data = base64.b64encode(made).decode()
         return self._put(
             f'<figure><img alt="{html.escape(caption, quote=True)}" src="data:image/{kind};base64,{data}">'
