@@ -19,7 +19,7 @@ ASSESSMENT, ASSESSED = "assessment.json", "assessment.png"
 CURVE, CURVED = "curve.json", "curve.png"
 _SIZES = ("4 mm and more", "8 mm and more", "all")
 _HEAD = ("d / mm", "h / mm", "E / kPa")
-_EXPOSURES = {1: "one exposure", 100: "mean of 100"}
+_EXPOSURES = {1: "one exposure", 100: "the mean of 100"}
 _BY = {"network": "the network alone", "rendered": "refined by rendering"}
 
 
