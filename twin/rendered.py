@@ -7,7 +7,6 @@ rendering at one specimen tell by how much it is off there, and nearby it is off
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,15 +14,10 @@ from numpy.typing import NDArray
 import fem
 from scenes.traced import TracedLight
 from twin import presses, retake
-from twin.chain import BLOCK, Chain, seen_by
-from twin.design import Design
+from twin.chain import BLOCK, Chain, seen_by, whole_blocks
 from twin.study import PARAMETERS
 
 Single = NDArray[np.float32]
-
-_BINNED = (
-    2  # pixels a side that are rendered as one: blocks' means change by 0.005 % (`tests/test_rendered.py`)
-)
 
 
 def rendered(
@@ -44,11 +38,9 @@ def rendered(
     size, depth, modulus, x, y = (float(values[name]) for name in PARAMETERS)
     inclusion = fem.Inclusion(size, depth, modulus, (x, y))
     presses.check_emulated(design, inclusion, depths, chain.emulator)
-    design, binned = coarser(design)
     renderer = SpectralRenderer(design.sensor(), count=design.light.bands, at=design.sensor, device="cpu")
     flux = np.array([led.flux_W for led in design.leds])
-    weights = chain.fluxes(values) / flux / chain.gain(values) / binned**2
-    block = BLOCK[0] // binned, BLOCK[1] // binned
+    weights = chain.fluxes(values) / flux / chain.gain(values)
     found = []
     for press in presses.emulated(design, inclusion, depths, chain.emulator):
         pair = []
@@ -57,15 +49,6 @@ def rendered(
                 press.surface, field=field, quality="preview", traced=tuple(traced)
             ).radiance
             pixels = retake.charge(design, layers, weights, (1, 1))
-            rows, columns = (side // cells * cells for side, cells in zip(pixels.shape, block, strict=True))
-            pair.append(retake.average(pixels[:rows, :columns], block))
+            pair.append(retake.average(whole_blocks(pixels), BLOCK))
         found.append(pair)
     return np.asarray(found, np.float32)
-
-
-def coarser(design: Design) -> tuple[Design, int]:
-    """Return a design whose camera bins pixels, where that leaves blocks whole, and how many a side."""
-    camera, binned = design.camera, _BINNED
-    if any(side % binned for side in (*camera.shape, *BLOCK)):
-        return design, 1
-    return replace(design, camera=replace(camera, binning=binned * camera.binning)), binned
