@@ -209,8 +209,8 @@ def values_of(rows: dict[int, Any]) -> list[Any]:
     return [tuple(sorted(one["values"].items())) for one in rows.values()]
 
 
-def test_two_processes_share_one_study(tmp_path: Path) -> None:
-    found = prepared(tmp_path)
+def shared(found: explore.Exploration) -> None:
+    """Two processes work on one study: every layout once, both had a part."""
     spawn = multiprocessing.get_context("spawn")
     crew = [spawn.Process(target=worker, args=(found.folder,)) for _ in range(2)]
     for one in crew:
@@ -218,11 +218,14 @@ def test_two_processes_share_one_study(tmp_path: Path) -> None:
     for one in crew:
         one.join(120)
         assert one.exitcode == 0
-    study = explore.opened(found)
-    done = [trial for trial in study.trials if trial.user_attrs.get("worker")]
+    done = [trial for trial in explore.opened(found).trials if trial.user_attrs.get("worker")]
     assert len(done) == len(records(found.folder)) == 12
     assert len({trial.user_attrs["worker"] for trial in done}) == 2
     assert len(set(values(found.folder))) == 12
+
+
+def test_two_processes_share_one_study(tmp_path: Path) -> None:
+    shared(prepared(tmp_path))
 
 
 def test_another_study_does_not_get_the_folder(tmp_path: Path) -> None:

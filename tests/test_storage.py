@@ -1,7 +1,6 @@
 """A study in a database that several machines share: a PostgreSQL server of its own, on loopback."""
 
 import json
-import multiprocessing
 import os
 import shutil
 import signal
@@ -13,7 +12,7 @@ from pathlib import Path
 
 import psycopg
 import pytest
-from test_explore import prepared, records, values, worker
+from test_explore import prepared, shared
 
 from twin import explore
 from twin.complaint import DesignError
@@ -67,17 +66,7 @@ def opened_soon(url: str) -> None:
 def test_processes_share_a_study_in_postgresql(tmp_path: Path, database: str) -> None:
     opened_soon(database)
     found = prepared(tmp_path, storage=database)
-    spawn = multiprocessing.get_context("spawn")
-    crew = [spawn.Process(target=worker, args=(found.folder,)) for _ in range(2)]
-    for one in crew:
-        one.start()
-    for one in crew:
-        one.join(120)
-        assert one.exitcode == 0
-    done = [trial for trial in explore.opened(found).trials if trial.user_attrs.get("worker")]
-    assert len(done) == len(records(found.folder)) == 12
-    assert len({trial.user_attrs["worker"] for trial in done}) == 2
-    assert len(set(values(found.folder))) == 12
+    shared(found)
     assert not (found.folder / explore.DATABASE).exists()
     assert json.loads((found.folder / explore.HEAD).read_text())["storage"] == database
 
