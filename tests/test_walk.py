@@ -268,7 +268,9 @@ def test_lobe_of_white_tissue_is_lambertian(steps: ModuleType) -> None:
     assert walked.reflectance[0] == pytest.approx(1.0, abs=2e-3)
 
 
-@pytest.mark.parametrize("cosine", [0.25, 0.5, 0.8])
+@pytest.mark.parametrize(
+    "cosine", [pytest.param(0.25, marks=pytest.mark.slow), 0.5, pytest.param(0.8, marks=pytest.mark.slow)]
+)
 def test_light_that_enters_aslant_comes_out_ahead(steps: ModuleType, variant: str, cosine: float) -> None:
     """Moments of where it leaves against the closed forms: mean, and squares along and across the way in."""
     import mitsuba as mi
