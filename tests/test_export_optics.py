@@ -55,7 +55,7 @@ def test_the_loaded_scene_is_ours_to_the_bit(variant, tmp_path, coupling):
     assert as_it_is.mean() == pytest.approx(wanted.mean(), rel=1e-5)
     theirs["contact.vertex_normals"] = mine["contact.vertex_normals"]
     theirs.update()
-    # on some processors, five pixels' sums are rounded the other way
+    # seen on one machine: five pixels' sums rounded the other way, with the same code and packages
     np.testing.assert_array_max_ulp(np.asarray(mi.render(loaded, spp=4, seed=3)), wanted, maxulp=1)
 
 
