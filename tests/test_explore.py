@@ -228,6 +228,27 @@ def test_two_processes_share_one_study(tmp_path: Path) -> None:
     shared(prepared(tmp_path))
 
 
+@pytest.mark.parametrize("method", ["nsga2", "tpe"])
+def test_no_layout_is_tried_twice(tmp_path: Path, method: str) -> None:
+    """Up to 3 LEDs in 2 arrangements: one LED makes one sensor twice, so 5 are tried before any repeats."""
+    text = STUDY.replace("METHOD", method).replace("trials = 12", "trials = 5").replace("[1, 8]", "[1, 3]")
+    text = text.replace('"layout.power_W" = [0.01, 0.07]\n"leds.*.z_mm" = [-11.0, -2.0]', ARRANGEMENTS)
+    (tmp_path / "few.toml").write_text(text)
+    found = explore.prepare(tmp_path / "few.toml", tmp_path / "out")
+    explore.work(found, evaluate=evaluated)
+    made = {
+        (tmp_path / "out" / "trials" / f"{one['number']:04d}" / "design.toml")
+        for one in records(found.folder)
+    }
+    assert len({path.read_text().split("\n", 1)[1] for path in made}) == 5
+    more = explore.prepare(tmp_path / "few.toml", tmp_path / "out", trials=7)  # there are no 7
+    explore.work(more, evaluate=evaluated)
+    assert explore.progress(more).complete == 7
+
+
+ARRANGEMENTS = '"layout.arrangement" = { choices = ["around", "one side"] }'
+
+
 def test_another_study_does_not_get_the_folder(tmp_path: Path) -> None:
     prepared(tmp_path, "latin", "out")
     with pytest.raises(DesignError, match=r"--out: .*same study"):

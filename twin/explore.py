@@ -30,7 +30,7 @@ from twin.design import Design, load_design, shipped_designs
 from twin.evaluate import Bench, Evaluation, Layout
 from twin.kept import Kept
 from twin.layout_study import Axis, LayoutStudy, Limit, Source, limits, load, parse
-from twin.proposals import distributions, grid_size, sampler
+from twin.proposals import grid_size
 
 if TYPE_CHECKING:
     import optuna
@@ -274,10 +274,7 @@ def _next(exploration: Exploration, optuna_study: optuna.Study, me: str) -> optu
         now = progress(exploration, optuna_study)
         if now.done + now.running >= exploration.trials:
             return None
-        optuna_study.sampler = sampler(exploration.study, now.done + now.running)
-        trial = optuna_study.ask(distributions(exploration.axes, exploration.design))
-        trial.set_user_attr("worker", me)
-        return trial
+        return proposals.ask(exploration.study, exploration.design, optuna_study, now.done + now.running, me)
 
 
 def _recover(exploration: Exploration, optuna_study: optuna.Study) -> None:

@@ -20,6 +20,52 @@ if TYPE_CHECKING:
 Axes = Mapping[str, Axis]
 
 
+_MOST_DRAWS = 100  # until a layout that was tried before is taken all the same: there may be no other
+
+
+def ask(
+    study: LayoutStudy, design: Design, optuna_study: optuna.Study, number: int, worker: str
+) -> optuna.Trial:
+    """Return the trial of this number, signed by a worker: a layout that none before it was.
+
+    Genetic search draws the same values again and again, and different ones may make the same sensor (one LED
+    is alone on its side, however many are to share it): such a draw is given up and counts as nothing. What
+    was planned beforehand is taken as it is.
+    """
+    from optuna.trial import TrialState
+
+    before = optuna_study.get_trials(deepcopy=False)
+    lost = [one.state == TrialState.FAIL and "reason" not in one.user_attrs for one in before]
+    taken = {one.user_attrs.get("makes") for one, gone in zip(before, lost, strict=True) if not gone}
+    given_up = sum(_REPEATS in trial.user_attrs for trial in before)
+    known = distributions(layout_fields.axes_of(study), design)
+    for draw in range(_MOST_DRAWS):
+        optuna_study.sampler = sampler(study, number + given_up + draw)
+        trial = optuna_study.ask(known)
+        makes = _makes(study, design, trial.params)
+        drawn = not {"again", "planned"} & set(trial.user_attrs)
+        if not drawn or makes not in taken or draw == _MOST_DRAWS - 1:
+            break
+        trial.set_user_attr(_REPEATS, True)
+        optuna_study.tell(trial, state=TrialState.FAIL)
+    trial.set_user_attr("makes", makes)
+    trial.set_user_attr("worker", worker)
+    return trial
+
+
+_REPEATS = "repeats another"
+
+
+def _makes(study: LayoutStudy, design: Design, values: Mapping[str, layout_fields.Value]) -> str:
+    """A short name of the sensor and protocol that values make; of the values where they make none."""
+    try:
+        made = layout_fields.layout(study, design, values)
+        told = repr((made.design, made.protocol))
+    except DesignError:
+        told = repr(sorted(values.items()))
+    return hashlib.sha256(told.encode()).hexdigest()[:16]
+
+
 def sampler(study: LayoutStudy, number: int) -> optuna.samplers.BaseSampler:
     """What chooses the layout of this number: its draws depend on the seed, the number and what is known."""
     import optuna
