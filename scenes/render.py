@@ -95,7 +95,7 @@ class Renderer:
 
     def render(
         self,
-        pressed: pv.PolyData,
+        pressed: pv.PolyData | surface.OpticalSurface,
         *,
         field: str = "pressure",
         quality: Quality = "standard",
@@ -110,7 +110,8 @@ class Renderer:
         Parameters
         ----------
         pressed
-            Contact surface: points (n, 3) mm undeformed, with point arrays `displacement` and `pressure`.
+            Contact surface: points (n, 3) mm undeformed, with point arrays `displacement` and `pressure`; or
+            what `surface.resample` makes of it.
         field
             "pressure", or "pressure_0" for the press without inclusion (and `displacement_0` with it).
         quality
@@ -138,7 +139,9 @@ class Renderer:
         from . import build, gather
 
         start = time.perf_counter()
-        shape = surface.resample(pressed, self.sensor.guide.width_mm, suffix=field.removeprefix("pressure"))
+        shape = pressed
+        if not isinstance(shape, surface.OpticalSurface):
+            shape = surface.resample(shape, self.sensor.guide.width_mm, suffix=field.removeprefix("pressure"))
         build.put_surface(self.scene, self.sensor, shape)
         sight = gather.look(self.scene, self.sensor, self.table, self.behind.coupling, self.rays)
         samples = samples or PATHS_PER_LED[quality]

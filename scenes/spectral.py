@@ -19,6 +19,7 @@ from .spectrum import Band, bands
 if TYPE_CHECKING:
     import pyvista as pv
 
+    from .surface import OpticalSurface
     from .traced import TracedLight
 
 _SEEDS = 2**26  # as many as a renderer keeps apart
@@ -73,7 +74,7 @@ class SpectralRenderer:
 
     def render(
         self,
-        pressed: pv.PolyData,
+        pressed: pv.PolyData | OpticalSurface,
         *,
         quality: Quality = "standard",
         seed: int = 0,

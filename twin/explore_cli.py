@@ -5,10 +5,14 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from twin.arguments import add_verb, whole
+from twin.arguments import add_verb, number, whole
 from twin.complaint import DesignError
+from twin.stage import staged_file
+
+if TYPE_CHECKING:
+    from twin.explore import Exploration
 
 _EXPLORE = """\
 Explore layouts of a sensor and ways to use it: which can tell most about an inclusion's size, depth and
@@ -22,6 +26,7 @@ examples:
   twin explore protocol --out protocol --emulator emulators/tsis.npz
   twin explore my-study.toml --out found --trials 200 --workers 8
   twin explore my-study.toml --out found --storage postgresql://user@host/studies
+  twin explore surface --out surface --confirm 20
 """
 
 
@@ -37,6 +42,12 @@ def add(verbs: Any) -> None:
         "--emulator", metavar="FILE.npz", help="of the design's mechanics (default emulators/DESIGN.npz)"
     )
     verb.add_argument("--plan", action="store_true", help="say what each field changes and how long it takes")
+    verb.add_argument(
+        "--confirm",
+        type=number(above=0.0),
+        metavar="MINUTES",
+        help="then follow light ray by ray through the base and the layout that tells E best",
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -82,4 +93,29 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"look at: {explore_report.write(found.folder)}")
     if state.done >= state.wanted:  # the report uses what is kept
         explore.clean(found)
+    if arguments.confirm and state.complete:
+        _confirm(found, arguments.confirm)
     return 0
+
+
+def _confirm(found: Exploration, minutes: float) -> None:
+    """Print how the base and the best layout answer to E by the reference quality; DIR/confirmed.json."""
+    from twin import confirm, explore_words, layout_fields, presses
+    from twin.reporting import Reporter
+
+    best = explore_words.best(found, "bound_modulus_kPa")
+    if best is None:
+        return
+    study, design = found.study, found.design
+    layouts = [layout_fields.base(study, design), layout_fields.layout(study, design, best["values"])]
+    names = ["the base", f"layout {best['number']}"]
+    emulator = None if found.emulator is None else presses.emulator_of(design, found.emulator)
+    with Reporter() as tell:
+        tell("judging both again", 0.0)
+        of_study = emulator, study.exposure_fill, study.quality, study.seed
+        both = [confirm.Follower(one, study.balls(), study.unknown(), *of_study) for one in layouts]
+        answers = confirm.compare(both, minutes, lambda done: tell("following light", done))
+    for line in confirm.in_words(names, answers):
+        print(line)
+    with staged_file(str(found.folder / confirm.FILE), "--out", ".json") as part:
+        part.write_text(confirm.record(names, answers), encoding="utf-8")

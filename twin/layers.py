@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,9 @@ from scenes.surface import OpticalSurface
 from twin.design import Design
 from twin.forward import Unknown
 from twin.touches import Touch, knows_inclusion, surface_of, touches_contact
+
+if TYPE_CHECKING:
+    from scenes import SpectralRenderer
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -70,7 +73,7 @@ class Lighting:
     samples: int = 0
     seconds: float = 0.0
     pictures: int = 0
-    _spectral: Any = None
+    _spectral: SpectralRenderer | None = None
     _places: dict[float, _Place] = field(default_factory=dict)
 
     def lit(
@@ -127,7 +130,7 @@ class Lighting:
 
     def _place(self, touch: Touch, level: float, moving: Sequence[Unknown]) -> _Place:
         if level not in self._places:
-            renderers = self._renderers()
+            renderers = self.spectral.renderers
             from scenes import tangent  # only now: see scenes.backend
 
             shape = surface_of(self.design, touch.plain)
@@ -155,7 +158,9 @@ class Lighting:
         there = surface_of(self.design, fields + step * touch.slopes[unknown.name][plain])
         return (self._picture(there, straight, traced) - layers) / step
 
-    def _renderers(self) -> list[Any]:
+    @property
+    def spectral(self) -> SpectralRenderer:
+        """The sensor's scenes, loaded when they are first asked for."""
         if self._spectral is None:
             from scenes import SpectralRenderer
 
@@ -163,14 +168,16 @@ class Lighting:
             self._spectral = SpectralRenderer(
                 design.sensor(), count=design.light.bands, at=design.sensor, device="cpu"
             )
-        return list(self._spectral.renderers)
+        return self._spectral
 
     def _traced(self, shape: OpticalSurface, straight: list[Any]) -> list[Floats]:
         from scenes import tangent
         from scenes.render import PATHS_PER_LED
 
         whole, found = self.samples or PATHS_PER_LED[self.quality], []
-        for number, (renderer, band) in enumerate(zip(self._renderers(), self._spectral.bands, strict=True)):
+        for number, (renderer, band) in enumerate(
+            zip(self.spectral.renderers, self.spectral.bands, strict=True)
+        ):
             seed = (self.seed + number * _SEED_STEP) % _SEEDS if number else self.seed
             paths = max(whole // band.parts, 2)
             found.append(tangent.traced(renderer, shape, straight[number], seed, self.quality, paths))
@@ -181,7 +188,7 @@ class Lighting:
         from scenes import tangent
 
         self.pictures += 1
-        renderers, spectral = self._renderers(), self._spectral
+        renderers, spectral = self.spectral.renderers, self.spectral
         each = [
             tangent.picture(renderer, shape, straight[number], traced[number])
             for number, renderer in enumerate(renderers)
