@@ -3,7 +3,6 @@
 Presses are made up in closed form, as in test_evaluate.py.
 """
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -24,11 +23,10 @@ BENCH = Bench(samples=2**15)
 
 
 @pytest.fixture(autouse=True)
-def presses(variant: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def presses(variant: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         touches.presses, "emulated", lambda d, b, levels, e: [Pressed(d, b, lv) for lv in levels]
     )
-    return
 
 
 def follower(**more: Any) -> Follower:
