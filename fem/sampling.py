@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import lru_cache
 from itertools import islice
 from typing import Annotated, Literal
 
@@ -329,6 +330,14 @@ def cubic(nodes: Floats, at: Floats) -> Floats:
     """Weights (m, n) of the nodes of a line, (n,), at places (m,): cubic Hermite, its slopes those of the
     parabola through a node and its neighbours. Unlike the elements' own shapes, answers at a fixed place have
     no kinks where nodes pass it, as they do when an inclusion moves."""
-    ends = np.eye(len(nodes))
-    slopes = np.gradient(ends, nodes, axis=0, edge_order=2)
-    return np.asarray(CubicHermiteSpline(nodes, ends, slopes)(at))
+    return _cubic(nodes.tobytes(), at.tobytes())
+
+
+@lru_cache(maxsize=256)  # specimens whose nodes are the same follow each other when slopes are found
+def _cubic(nodes: bytes, at: bytes) -> Floats:
+    line = np.frombuffer(nodes)
+    ends = np.eye(len(line))
+    slopes = np.gradient(ends, line, axis=0, edge_order=2)
+    found = np.asarray(CubicHermiteSpline(line, ends, slopes)(np.frombuffer(at)))
+    found.flags.writeable = False
+    return found

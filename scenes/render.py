@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -42,8 +43,7 @@ class Rendering:
         Radiance at the lens from each LED, W m⁻² sr⁻¹.
     position_mm : (rows, columns, 2)
         Point of the deformed contact surface that the middle of each pixel sees, x and y, mm.
-    pressure, displacement_z : (rows, columns)
-        Contact pressure, kPa, and displacement, mm (+z into the specimen), at that point.
+    surface : what is looked at.
     noise_percent : float
         Standard error of the radiance of all LEDs together from Monte Carlo: root mean square over pixels, in
         per cent of the mean; from the spread of independent passes.
@@ -58,13 +58,26 @@ class Rendering:
 
     radiance: NDArray[np.float32]
     position_mm: NDArray[np.float32]
-    pressure: NDArray[np.float32]
-    displacement_z: NDArray[np.float32]
+    surface: surface.OpticalSurface
     noise_percent: float
     seconds: float
     sinks: Array | None = None
     trapped: Array | None = None
     traced: tuple[Array, ...] | None = None
+
+    @property
+    def pressure(self) -> NDArray[np.float32]:
+        """Contact pressure at each pixel's point, (rows, columns) kPa."""
+        return self._fields[0]
+
+    @property
+    def displacement_z(self) -> NDArray[np.float32]:
+        """Displacement at each pixel's point, (rows, columns) mm, +z into the specimen."""
+        return self._fields[1]
+
+    @cached_property
+    def _fields(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        return surface.at(self.surface, self.position_mm)
 
 
 class Renderer:
@@ -158,13 +171,11 @@ class Renderer:
             self.check_leds(shape)
             pictures = self._gathered(shape, sight, max(samples // passes, 2), seed, lights)
         radiance, found = _averaged(pictures, passes, noise, progress or (lambda done: None))
-        pressure, displacement_z = surface.at(shape, sight.position_mm)
         return Rendering(
             # the smoothing kernel has negative sides: next to an edge of light they may undershoot the dark
             np.maximum(radiance, 0.0).astype(np.float32),
             sight.position_mm,
-            pressure,
-            displacement_z,
+            shape,
             found,
             time.perf_counter() - start,
             np.mean([light.sinks for light in lights], axis=0) if lights else None,

@@ -7,15 +7,23 @@ rendering at one specimen tell by how much it is off there, and nearby it is off
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 import fem
+from scenes.surface import resample
 from scenes.traced import TracedLight
 from twin import presses, retake
 from twin.chain import BLOCK, Chain, seen_by, whole_blocks
+from twin.design import Design
 from twin.study import PARAMETERS
+
+if TYPE_CHECKING:
+    from scenes import SpectralRenderer
 
 Single = NDArray[np.float32]
 
@@ -27,7 +35,7 @@ def rendered(
 
     Raises `fem.NotModelled` outside of the emulator or of the learned light.
     """
-    from scenes import SpectralRenderer, backend
+    from scenes import backend
 
     backend.use("cpu")
     import drjit as dr
@@ -38,17 +46,32 @@ def rendered(
     size, depth, modulus, x, y = (float(values[name]) for name in PARAMETERS)
     inclusion = fem.Inclusion(size, depth, modulus, (x, y))
     presses.check_emulated(design, inclusion, depths, chain.emulator)
-    renderer = SpectralRenderer(design.sensor(), count=design.light.bands, at=design.sensor, device="cpu")
+    renderer, width = _renderer(chain.design), chain.design.waveguide.width_mm
+    felt = np.float64(_yields(chain.design) / _yields(design))
     flux = np.array([led.flux_W for led in design.leds])
     weights = chain.fluxes(values) / flux / chain.gain(values)
     found = []
     for press in presses.emulated(design, inclusion, depths, chain.emulator):
         pair = []
-        for field in ("pressure", "pressure_0"):
-            layers = renderer.render(
-                press.surface, field=field, quality="preview", traced=tuple(traced)
-            ).radiance
+        for suffix in ("", "_0"):
+            shape = resample(press.surface, width, suffix=suffix)
+            shape = replace(shape, pressure_kPa=felt * shape.pressure_kPa)
+            layers = renderer.render(shape, quality="preview", traced=tuple(traced)).radiance
             pixels = retake.charge(design, layers, weights, (1, 1))
             pair.append(retake.average(whole_blocks(pixels), BLOCK))
         found.append(pair)
     return np.asarray(found, np.float32)
+
+
+@lru_cache(maxsize=1)
+def _renderer(design: Design) -> SpectralRenderer:
+    """The scene of a design, built once: what varies of the skin and the tissue is felt as pressure."""
+    from scenes import SpectralRenderer
+
+    return SpectralRenderer(design.sensor(), count=design.light.bands, at=design.sensor, device="cpu")
+
+
+def _yields(design: Design) -> float:
+    """The pressure that the contact's law measures others by, kPa: E* h' / κ."""
+    surface = design.surface
+    return float(design.effective_modulus_kPa * surface.rms_slope / surface.kappa)
