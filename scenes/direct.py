@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 CELLS = 200  # of the grid of target points, per side
 DISC_POINTS = 96
 _NEWTON_STEPS = 7  # from a guess
-_NEWTON_AGAIN = 2, 3  # from the disc's point before, if there are so many points, or fewer
+_NEWTON_AGAIN = 1, 2  # from what the disc's point before foretold, if there are so many points, or fewer
 _STRIPES = 9
 _GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 
@@ -102,15 +102,19 @@ def on(sensor: Sensor, basis: AngularBasis, ground: Array, points: int = DISC_PO
 
     def add(number, straight, mirrored, *total):  # type: ignore[no-untyped-def]
         on_disc = dr.gather(mi.Point2f, disc, number)
+        onwards = dr.gather(mi.Point2f, disc, dr.minimum(number + 1, end - 1)) - on_disc
         slopes = []
         for by_glass, begin in ((False, straight), (True, mirrored)):
-            flux, (cosine, d_x, d_y), slope = _arrives(sensor, source, on_disc, here, by_glass, begin, steps)
+            flux, (cosine, d_x, d_y), slope = _arrives(
+                sensor, source, on_disc, here, by_glass, begin, onwards, steps
+            )
             weight = weights.at(cosine, d_x, d_y, flux > 0.0)
             total = tuple(sum_ + flux * w for sum_, w in zip(total, weight, strict=True))
             slopes.append(slope)
         return number + 1, *slopes, *total
 
-    begin = [_first_guess(sensor, source, here, by_glass) for by_glass in (False, True)]
+    first = dr.gather(mi.Point2f, disc, dr.zeros(mi.UInt32, dr.width(index)))
+    begin = [_first_guess(sensor, source, first, here, by_glass) for by_glass in (False, True)]
     state = (mi.UInt32(0), *begin, *(mi.Float(0.0) for _ in range(basis.layers)))
     total = list(dr.while_loop(state, more, add))[3:]
     dr.eval(total)
@@ -177,9 +181,11 @@ class _Source:
         return _Source(led, Patterns(sensor.leds), *columns)
 
 
-def _first_guess(sensor: Sensor, source: _Source, here: list[mi.Float], by_glass: bool) -> mi.Vector2f:
-    """Slopes of the ray from the middle of the disc that a vanishing air gap would give."""
-    reach, aside, up = _way(sensor, source, mi.Point2f(0.0, 0.0), here, by_glass)
+def _first_guess(
+    sensor: Sensor, source: _Source, on_disc: mi.Point2f, here: list[mi.Float], by_glass: bool
+) -> mi.Vector2f:
+    """Slopes of the ray from a point of the disc, from those that a vanishing air gap would give."""
+    reach, aside, up = _way(sensor, source, on_disc, here, by_glass)
     reach = dr.maximum(reach, 1e-3)
     sine_y, sine_z = aside / reach, up / reach
     scale = sensor.guide.refractive_index * dr.rsqrt(1.0 + dr.square(sine_y) + dr.square(sine_z))
@@ -216,6 +222,14 @@ def _stepped(path: _Path, slope: mi.Vector2f) -> mi.Vector2f:
     return mi.Vector2f(t_y, dr.maximum(t_z, 0.25 * slope.y))
 
 
+def _foretold(path: _Path, slope: mi.Vector2f, move: mi.Vector2f, by_glass: bool) -> mi.Vector2f:
+    """Slopes of the ray to the same target from a point of the disc so far along the side and up, to first
+    order."""
+    rise = (move.y if by_glass else -move.y) / path.p_z
+    moved = mi.Vector2f(path.error.x + path.p_x * rise, path.error.y + path.p_y * rise + move.x)
+    return _stepped(replace(path, error=moved), slope)
+
+
 def _arrives(
     sensor: Sensor,
     source: _Source,
@@ -223,11 +237,12 @@ def _arrives(
     here: list[mi.Float],
     by_glass: bool,
     begin: mi.Vector2f,
+    onwards: mi.Vector2f,
     steps: int,
 ) -> tuple[mi.Float, tuple[mi.Float, ...], mi.Vector2f]:
     """Irradiance, W/mm², at the targets from one point of each disc; the cosine of incidence there and the
-    direction along x and y; and the ray's slopes at the disc, found in so many steps from those of a point
-    nearby."""
+    direction along x and y; and what the ray's slopes will be from the next point, so far ``onwards``. They
+    are found in so many steps of Newton's method from what the point before foretold."""
     slope_x, slope_y = here[3:]
     guide, glass = sensor.guide, sensor.glass
     half, n, n_glass = guide.width_mm / 2, guide.refractive_index, glass.refractive_index
@@ -239,7 +254,8 @@ def _arrives(
         slope = _stepped(_follow(sensor, source, way, by_glass, slope), slope)
     path = _follow(sensor, source, way, by_glass, slope)
 
-    lit &= dr.abs(path.error.x) + dr.abs(path.error.y) < 1e-2
+    lands = dr.abs(path.error.x) + dr.abs(path.error.y) < 1e-2
+    lit &= lands
     entry_z = disc_z - path.entry_z if by_glass else disc_z + path.entry_z
     lit &= (entry_z > -guide.thickness_mm) & (dr.abs(side_y + path.entry_y) < half)
     if guide.walls != "polished":
@@ -266,7 +282,8 @@ def _arrives(
         rises = -path.p_z if by_glass else path.p_z
         flux *= source.patterns.relative(source.number, leaving, path.p_y, rises)
     lit &= facing > 0.0
-    found = dr.select(lit & dr.isfinite(slope.x + slope.y), slope, begin)
+    next_ = _foretold(path, slope, source.radius * onwards, by_glass)
+    found = dr.select(lands & dr.isfinite(next_.x + next_.y), next_, begin)
     arriving = tuple(dr.select(lit, value, 1.0) for value in (cosine, d_x, d_y))
     return dr.select(lit, flux, 0.0), arriving, found
 
