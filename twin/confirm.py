@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-FILE = "confirmed.json"
 UNKNOWN = "modulus_kPa"
 PATHS = 2**17
 """Light paths per LED of one picture."""
@@ -248,8 +247,8 @@ def in_words(names: Sequence[str], answers: Sequence[Answers]) -> list[str]:
 
 
 def record(names: Sequence[str], answers: Sequence[Answers]) -> str:
-    """Return the same as JSON."""
-    found = [
+    """Return the same as JSON, with the lines."""
+    layouts = [
         {
             "layout": name,
             "bound_kPa": one.bound.tolist(),
@@ -264,4 +263,4 @@ def record(names: Sequence[str], answers: Sequence[Answers]) -> str:
         }
         for name, one in zip(names, answers, strict=True)
     ]
-    return json.dumps(found, indent=1) + "\n"
+    return json.dumps({"lines": in_words(names, answers), "layouts": layouts}, indent=1) + "\n"

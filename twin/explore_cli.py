@@ -100,7 +100,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _confirm(found: Exploration, minutes: float) -> None:
     """Print how the base and the best layout answer to E by the reference quality; DIR/confirmed.json."""
-    from twin import confirm, explore_words, layout_fields, presses
+    from twin import confirm, explore_report, explore_words, layout_fields, presses
     from twin.reporting import Reporter
 
     best = explore_words.best(found, "bound_modulus_kPa")
@@ -117,5 +117,6 @@ def _confirm(found: Exploration, minutes: float) -> None:
         answers = confirm.compare(both, minutes, lambda done: tell("following light", done))
     for line in confirm.in_words(names, answers):
         print(line)
-    with staged_file(str(found.folder / confirm.FILE), "--out", ".json") as part:
+    with staged_file(str(found.folder / explore_report.CONFIRMED), "--out", ".json") as part:
         part.write_text(confirm.record(names, answers), encoding="utf-8")
+    explore_report.write(found.folder)

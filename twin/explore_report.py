@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import base64
 import html
+import json
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -24,6 +25,9 @@ from twin.explore_results import Importance, Results, Trial, importances, read
 from twin.forward import noise_of
 from twin.objectives import OBJECTIVES, STANDARD
 from twin.report import Page, digits
+
+CONFIRMED = "confirmed.json"
+"""What `twin explore --confirm` leaves in the folder."""
 
 _MOST_CHANGES = 4
 _SYMBOLS = {"size_mm": ("d", "mm"), "depth_mm": ("h", "mm"), "modulus_kPa": ("E", "kPa")}
@@ -82,6 +86,7 @@ def page(results: Results) -> Page:
         _mattered(made, mattered, len(results.trials))
     _leds(made, [results.baseline, *best[:1]])
     _designs(made, results, best)
+    _confirmed(made, results.folder / CONFIRMED)
     _limits(made, results)
     return made
 
@@ -322,6 +327,13 @@ def _designs(made: Page, results: Results, best: Sequence[Trial]) -> None:
             f'<pre>{html.escape(command)}</pre>\n<pre id="toml-{number}">{html.escape(text)}</pre></details>'
         )
     made.markup("\n".join([*parts, _COPY]))
+
+
+def _confirmed(made: Page, file: Path) -> None:
+    """What `twin explore --confirm` found."""
+    if file.is_file():
+        made.section("Light followed ray by ray")
+        made.bullets(json.loads(file.read_bytes())["lines"])
 
 
 def _limits(made: Page, results: Results) -> None:
