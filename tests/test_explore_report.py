@@ -1,7 +1,9 @@
 """The page of a layout study: what it picks, what it escapes, and that a browser shows it without network."""
 
 import re
+from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from twin import explore_leds, explore_report
 from twin.complaint import DesignError
 from twin.explore_figures import least_size, shares
 from twin.explore_results import front, importances, read, winners
+from twin.explore_verdict import advised
 from twin.objectives import BOUNDS
 
 
@@ -55,6 +58,36 @@ def test_results_are_those_of_the_folder(study: Path) -> None:
     assert best.objectives["bound_modulus_kPa"] == min(
         trial.objectives["bound_modulus_kPa"] for trial in results.trials
     )
+
+
+@dataclass
+class Judged:
+    """A layout with two objectives, as `explore_verdict.advised` asks for them."""
+
+    objectives: dict[str, float]
+
+
+@dataclass
+class Found:
+    """Results of a search for the least bound and the deepest detection."""
+
+    baseline: Judged
+    found: list[Judged]
+    objectives: ClassVar = {"bound_modulus_kPa": "minimize", "detection_depth_mm": "maximize"}
+
+    def best(self) -> list[Judged]:
+        return self.found
+
+
+def test_what_is_advised_costs_nothing() -> None:
+    """The best by the first objective, unless it is clearly worse than the baseline by another."""
+    blind, better, deep = (
+        Judged({"bound_modulus_kPa": bound, "detection_depth_mm": depth})
+        for bound, depth in ((9.0, 2.6), (9.6, 8.8), (10.5, 9.8))
+    )
+    base = Judged({"bound_modulus_kPa": 11.7, "detection_depth_mm": 8.9})
+    for found, wanted in (([blind, better, deep], better), ([better, deep], better), ([blind], blind)):
+        assert advised(Found(base, found)) is wanted  # type: ignore[arg-type]
 
 
 def test_shares_are_the_budgets(study: Path) -> None:

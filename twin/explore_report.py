@@ -11,7 +11,6 @@ import json
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -19,9 +18,9 @@ from estimation.budget import Budget
 from twin import explore_figures as figures
 from twin import explore_leds
 from twin.complaint import DesignError
-from twin.design import Design, load_design
 from twin.explore_front import front
 from twin.explore_results import Importance, Results, Trial, importances, read
+from twin.explore_verdict import design_of, in_words, verdict
 from twin.forward import noise_of
 from twin.objectives import OBJECTIVES, STANDARD
 from twin.report import Page, digits
@@ -29,7 +28,6 @@ from twin.report import Page, digits
 CONFIRMED = "confirmed.json"
 """What `twin explore --confirm` leaves in the folder."""
 
-_MOST_CHANGES = 4
 _SYMBOLS = {"size_mm": ("d", "mm"), "depth_mm": ("h", "mm"), "modulus_kPa": ("E", "kPa")}
 _COPY = """\
 <script>
@@ -91,92 +89,10 @@ def page(results: Results) -> Page:
     return made
 
 
-def verdict(results: Results, mattered: Sequence[Importance] = ()) -> list[str]:
-    """Return what to build, why, and what still limits it: three lines."""
-    best = results.best()
-    name, way = next(iter(results.objectives.items()))
-    if not best:
-        return [
-            "No layout could be judged: see the reasons below.",
-            f"{len(results.infeasible)} were tried.",
-            "Widen the fields' ranges or the constraints.",
-        ]
-    top, base = best[0], results.baseline
-    now, before = top.objectives[name], base.objectives.get(name, np.nan)
-    words = OBJECTIVES[name].text
-    gain = before / now if way == "minimize" else now / before
-    if gain > 1.01:
-        first = (
-            f"Build {top.name}: {words}: {digits(now)} instead of {digits(before)}, {gain:.2f} times better, "
-            f"with {changes(top, base)}."
-        )
-    elif gain >= 0.99:
-        first = f"Keep the baseline: no layout is clearly better in this: {words} ({digits(before)})."
-    else:
-        first = (
-            f"Keep the baseline: {words}: {digits(before)}; the best that was found, {top.name}, "
-            f"has {digits(now)}."
-        )
-    return [first, _why(results, top, mattered), _still(top, base)]
-
-
-def changes(trial: Trial, base: Trial, most: int = _MOST_CHANGES) -> str:
-    """Return which values differ from the baseline's, in words."""
-    found = [
-        f"{name} = {_value(value)}"
-        for name, value in trial.values.items()
-        if base.values.get(name) is None or base.values[name] != value
-    ]
-    if not found:
-        return "the baseline's own values"
-    text = ", ".join(found[:most])
-    return text if len(found) <= most else f"{text} and {len(found) - most} more"
-
-
-def _why(results: Results, top: Trial, mattered: Sequence[Importance]) -> str:
-    parts = []
-    if mattered:
-        one = mattered[0]
-        leading = sorted(one.share.items(), key=lambda item: -item[1])[:2]
-        said = ", then ".join(f"{name} ({100 * share:.0f} %)" for name, share in leading)
-        parts.append(f"what moves it most is {said}")
-    compared = [
-        f"{words} {digits(top.objectives[name])}{unit} (baseline {digits(results.baseline.objectives[name])})"
-        for name, words, unit in (("snr", "tared signal over noise", ""), ("led_power_W", "LED flux", " W"))
-        if name in top.objectives and name in results.baseline.objectives
-    ]
-    return "Why: " + "; ".join(filter(None, [*parts, ", ".join(compared)])) + "."
-
-
-def _still(top: Trial, base: Trial) -> str:
-    text = "What still limits it: "
-    try:
-        share = figures.shares(top, "modulus_kPa")
-    except (OSError, KeyError, ValueError):
-        share = {}
-    if share:
-        name, (_, halved) = max(share.items(), key=lambda item: item[1][1])
-        text += f"knowing {name} twice as well would take {100 * halved:.0f} % off the bound on E"
-        if name.startswith("noise"):
-            text = text.replace(f"knowing {name} twice as well", "halving the pictures' noise")
-    else:
-        text += "not stored"
-    reach, before = (one.objectives.get("detection_depth_mm") for one in (top, base))
-    if reach is not None and before is not None:
-        size, modulus = STANDARD
-        design = _design(top)
-        slab = np.inf if design is None else design.specimen.thickness_mm
-        deep = [f"{digits(one)} mm deep" if one < slab else "at any depth" for one in (reach, before)]
-        if min(reach, before) < slab:
-            text += f"; a lump of {size:g} mm and {modulus:g} kPa would be found {deep[0]} "
-            text += f"(baseline: {deep[1]})"
-    return text + "."
-
-
 def _best(made: Page, results: Results, shown: Sequence[Trial]) -> None:
     made.section("Best beside the baseline")
     fields = [name for name in results.fields() if any(name in one.values for one in shown)]
-    rows = [[name, *(_value(one.values.get(name, "—")) for one in shown)] for name in fields]
+    rows = [[name, *(in_words(one.values.get(name, "—")) for one in shown)] for name in fields]
     strong = []
     for name, objective in OBJECTIVES.items():
         if not any(name in one.objectives for one in shown):
@@ -190,7 +106,7 @@ def _best(made: Page, results: Results, shown: Sequence[Trial]) -> None:
         "Fields of the study, then all objectives; shaded: those it searched by.",
         strong,
     )
-    designs = [_design(one) for one in shown]
+    designs = [design_of(one) for one in shown]
     held = [(one, design) for one, design in zip(shown, designs, strict=True) if design is not None]
     if not held:
         return
@@ -235,7 +151,7 @@ def _known(made: Page, results: Results, shown: Sequence[Trial]) -> None:
             "All known: with every unknown but d, h and E known exactly, so that noise alone is left.",
         )
     if any("detection_depth_mm" in one.objectives for one in shown):
-        design = _design(shown[0])
+        design = design_of(shown[0])
         slab = 30.0 if design is None else design.specimen.thickness_mm
         made.figure(
             figures.found_by_depth(shown, STANDARD, slab),
@@ -365,13 +281,6 @@ def _limits(made: Page, results: Results) -> None:
     made.bullets(items)
 
 
-def _design(trial: Trial) -> Design | None:
-    try:
-        return load_design(trial.folder / "design.toml")
-    except (DesignError, OSError):
-        return None
-
-
 def _frames(trial: Trial) -> int:
     return int(trial.told.get("protocol", {}).get("frames", 1))
 
@@ -390,7 +299,3 @@ def _has_budget(trial: Trial) -> bool:
 def _found(value: float | None) -> str:
     """An objective: whole numbers as such."""
     return f"{value:.0f}" if value is not None and value == round(value) else digits(value)
-
-
-def _value(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
