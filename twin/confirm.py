@@ -46,11 +46,12 @@ _LEAST = 3  # repeats, for a spread
 
 @dataclass(frozen=True)
 class Answers:
-    """How one layout's pictures change with the modulus, in sd of the noise of its camera, per kPa.
+    """How one layout's pictures change with the modulus, in sd of the noise of its camera, per kPa (per e-fold
+    where the unknown is relative).
 
     Attributes
     ----------
-    bound : on the modulus, of each inclusion, kPa.
+    bound : on the modulus, of each inclusion, in its unit.
     judged : (inclusions,) of all else known, in the light that the layout was judged by.
     followed : (repeats, inclusions) the same by light followed ray by ray.
     judged_alone, followed_alone : the same of all else unknown.
@@ -135,12 +136,14 @@ class Follower:
             seconds,
             self.balls[0],
         )
-        self._pairs = [self._pressed(work, ball) for ball in self.balls]
+        relative = any(unknown.relative for unknown in found.unknowns if unknown.name == UNKNOWN)
+        self._steps = [_STIFFER * (1.0 if relative else ball.modulus) for ball in self.balls]
+        self._pairs = [self._pressed(work, *one) for one in zip(self.balls, self._steps, strict=True)]
         self._lighting = Lighting(found.camera)
 
-    def _pressed(self, work: Work, ball: fem.Inclusion) -> list[tuple[Any, Any]]:
+    def _pressed(self, work: Work, ball: fem.Inclusion, step: float) -> list[tuple[Any, Any]]:
         """Contacts as they are and of a stiffer inclusion, of every press."""
-        pairs, step = [], _STIFFER * ball.modulus
+        pairs = []
         for place in self.layout.protocol.positions_mm:
             for level in self.layout.protocol.indentation_mm:
                 touch = work.touch(ball, level, place)
@@ -153,7 +156,7 @@ class Follower:
         spectral, seed = self._lighting.spectral, len(self._found)
         many = sum(len(pairs) for pairs in self._pairs)
         found, done = [], 0
-        for number, (ball, pairs) in enumerate(zip(self.balls, self._pairs, strict=True)):
+        for number, pairs in enumerate(self._pairs):
             total = np.zeros(2)
             for press, shapes in enumerate(pairs):
                 own = (seed * many + done) % 2**20
@@ -166,7 +169,7 @@ class Follower:
                 total += np.array([np.sum(one[press] * (after - before)) for one in self._filters[number][0]])
                 done += 1
                 progress(done / many)
-            found.append(total / (_STIFFER * ball.modulus))
+            found.append(total / self._steps[number])
         self._found.append(np.array(found))
 
     def _counts(self, radiance: Any) -> Floats:
@@ -251,9 +254,9 @@ def record(names: Sequence[str], answers: Sequence[Answers]) -> str:
     layouts = [
         {
             "layout": name,
-            "bound_kPa": one.bound.tolist(),
-            "judged_per_kPa": one.judged.tolist(),
-            "followed_per_kPa": one.followed.mean(axis=0).tolist(),
+            "bound": one.bound.tolist(),
+            "judged": one.judged.tolist(),
+            "followed": one.followed.mean(axis=0).tolist(),
             "followed_sd": (one.followed.std(axis=0, ddof=1) / np.sqrt(len(one.followed))).tolist(),
             "share": one.share[0],
             "share_sd": one.share[1],

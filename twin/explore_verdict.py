@@ -53,7 +53,7 @@ def verdict(results: Results, mattered: Sequence[Importance] = ()) -> list[str]:
 
 
 def advised(results: Results) -> Trial:
-    """Return the first of the winners that no objective finds clearly worse than the baseline, or the first."""
+    """Return the first of the winners that is clearly worse than the baseline in nothing, or the first."""
     best = results.best()
     return next((one for one in best if not _lost(results, one)), best[0])
 
