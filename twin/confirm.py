@@ -46,8 +46,7 @@ _LEAST = 3  # repeats, for a spread
 
 @dataclass(frozen=True)
 class Answers:
-    """How one layout's pictures change with the modulus, in sd of the noise of its camera, per kPa (per e-fold
-    where the unknown is relative).
+    """How one layout's pictures change with the modulus, in sd of its camera's noise, per unit of it.
 
     Attributes
     ----------
