@@ -35,7 +35,7 @@ def follower(**more: Any) -> Follower:
 
 def test_the_same_light_answers_the_same() -> None:
     """Whole pictures in the light that judged answer as their slopes said, and all else known is a bound."""
-    one = follower(follow="preview", paths=2**14)
+    one = follower(follow="preview", paths=2**15)
     for _ in range(3):
         one.again()
     found = one.answers
@@ -49,7 +49,7 @@ def test_the_same_light_answers_the_same() -> None:
         least = bound(told.information, ["modulus_kPa"], prior=False, known=others).sd[0]
         assert response == pytest.approx(1.0 / least, rel=1e-6)
         assert alone < response
-    assert found.paths == 3 * 2 * 2 * 2 * 2**14  # repeats, inclusions, ends, LEDs
+    assert found.paths == 3 * 2 * 2 * 2 * 2**15  # repeats, inclusions, ends, LEDs
 
 
 @pytest.mark.slow
