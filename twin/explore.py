@@ -220,7 +220,7 @@ def opened(exploration: Exploration) -> optuna.Study:
             )
     except Exception as error:  # SQLAlchemy's and its drivers' many ways to say no
         reason = " ".join(str(error).split())[:120]
-        allowed = "a URL that SQLAlchemy opens (sqlite:///FILE, postgresql://..., mysql://...)"
+        allowed = "a URL that SQLAlchemy opens (sqlite:///FILE, postgresql://..., mysql+pymysql://...)"
         place = re.sub("(?<=:)[^:/@]+(?=@)", "***", exploration.url)  # without the password
         raise DesignError("--storage", f"{place} ({reason})", allowed) from None
 
