@@ -29,7 +29,7 @@ def truth(x: NDArray[np.float64]) -> NDArray[np.float64]:
 def light_map(x: NDArray[np.float64]) -> NDArray[np.float64]:
     """The same, off by more than the noise, and by other amounts elsewhere, along the valley too."""
     along = np.stack([np.cos(np.asarray(x)[..., 2] / 40.0 + n) for n in range(K)], axis=-1)
-    return truth(x) * 1.01 + 0.1 + 0.002 * np.asarray(x)[..., :1] + 0.05 * along
+    return truth(x) * 1.01 + 0.1 + 0.002 * np.asarray(x)[..., :1] + 0.1 * along
 
 
 class Features:
@@ -100,6 +100,18 @@ def test_valley_is_the_posterior(modulus: float, monkeypatch: pytest.MonkeyPatch
     drawn = found.samples[:, :3]
     assert np.all(np.abs(drawn.mean(axis=0) - mean) < 0.15 * sd)
     assert np.all(np.abs(drawn.std(axis=0) / sd - 1.0) < 0.12)
+
+
+@pytest.mark.parametrize("modulus", [60.0, 85.0, 110.0])
+def test_a_wrong_map_is_no_knowledge_of_the_modulus(modulus: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its error changes along the valley by ten times the noise: the posterior is that of a perfect map."""
+    x = np.array([7.0, 6.0, modulus, 0.3, -0.2, 0.4])
+    wrong = refined(x, 9.0, seed=5).samples[:, :3]
+    monkeypatch.setitem(globals(), "light_map", truth)
+    right = refined(x, 9.0, seed=5).samples[:, :3]
+    print(modulus, wrong.mean(axis=0), right.mean(axis=0), wrong.std(axis=0) / right.std(axis=0))
+    assert np.all(np.abs(wrong.mean(axis=0) - right.mean(axis=0)) < 0.2 * right.std(axis=0))
+    assert np.all(np.abs(wrong.std(axis=0) / right.std(axis=0) - 1.0) < 0.15)
 
 
 def test_the_error_of_the_map_goes() -> None:

@@ -5,18 +5,19 @@ exposure. So the most probable specimen is rendered, what the map is off there i
 and the fit goes on; where it ends, the map's own error no longer matters to first order. What remains unknown
 lies along a narrow, bent valley: a stiffer inclusion that is a little smaller looks nearly the same. It is
 followed from modulus to modulus, all else most probable and normal around it at each (Laplace's method for
-marginals: Tierney and Kadane 1986, [tierney1986]).
+marginals: Tierney and Kadane 1986, [tierney1986]). At each of these moduli the specimen is rendered again: a
+map's error changes along the valley by more than the noise, and would pass for knowledge of the modulus.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, stats
-from scipy.interpolate import CubicSpline, PchipInterpolator, interp1d
+from scipy.interpolate import CubicSpline, interp1d
 
 from estimation.features import Features
 from twin.chain import Chain
@@ -34,12 +35,14 @@ _SHORT = 1e-3  # of the prior's spread: a way that tells nothing of how the erro
 _REMAINS = 0.05  # of the map's error after its correction nearby (see `tests/test_refining.py`)
 _STRANGE = 1e-4  # chance of a misfit, below which the noise is taken to be louder than told
 _LOUDEST = 10.0  # times its variance that are believed
-_NODES = 9  # moduli at which all else is fitted
-_REACH = 3.5  # standard deviations that they go away from the most probable
-_STEPS = 2  # of Gauss and Newton at each, from its neighbour
+_STEPS = 6  # of Gauss and Newton at most, with the modulus held
+_LOOKS = 3  # renderings at most for one modulus
+_REACH = 1.5  # standard deviations to the next modulus, as the fit has them: it may be wrong by a factor
+_SMALL = 0.02  # of that way: no side to go to
+_ENOUGH, _FAR = 3.0, 4.5  # falls of the log density: that need not be passed, and that is aimed at
+_STEEP = 2.0  # a fall from one modulus to the next that asks for one between
+_NODES = 9  # moduli at most
 _FINE = 800  # moduli in between
-_ENDS = (0.1, 0.9)  # of the posterior
-_LONG = 0.12  # of the moduli's range: a valley along which the map's error changes
 _HELD = 2  # the modulus, among `PARAMETERS`
 
 
@@ -107,18 +110,14 @@ def refine(
             break
     assert near is not None
     louder = found.chi_square / len(features.spread) if _strange(found, features) else 1.0
-    followed = valley(chain, features, prior, observed, frames, found, remains, near, louder)
-    ends = [inside(prior, x) for x in followed.ends()]
-    if ends[1][_HELD] - ends[0][_HELD] > _LONG * (prior.ranges[_HELD, 1] - prior.ranges[_HELD, 0]):
-        seen = []
-        for x in ends:
-            values = prior.values(x)
-            rest = placed(render(values)[None], [values])[0] - expected(chain, prior, [x])[0]
-            seen.append((x, np.asarray(rest, np.float32)))
-        near, renders = _bent(near, seen, prior), renders + 2
-        found = fit(chain, features, prior, observed, frames, found.x, remains, near)
-        followed = valley(chain, features, prior, observed, frames, found, remains, near, louder)
-    return Refined(followed.draw(prior, samples, seed), found, near, bool(louder < _LOUDEST), renders)
+
+    def off(x: Floats) -> Single:
+        values = prior.values(x)
+        seen = placed(render(values)[None], [values])[0]
+        return np.asarray(seen - expected(chain, prior, [x])[0], np.float32)
+
+    followed, more = valley(chain, features, prior, observed, frames, found, remains, off, louder)
+    return Refined(followed.draw(prior, samples, seed), found, near, bool(louder < _LOUDEST), renders + more)
 
 
 def _corrected(near: Near | None, at: Floats, off: Single, prior: Prior) -> Near:
@@ -129,8 +128,7 @@ def _corrected(near: Near | None, at: Floats, off: Single, prior: Prior) -> Near
     posterior all of a way along the valley would be laid to the little that it goes across.
     """
     if near is None:
-        none = np.zeros((0, *off.shape), np.float32)
-        return Near(at, off, np.zeros((0, len(at))), none, none)
+        return _flat(at, off)
     way, metric = at - near.at, np.diag(prior.precision)
     length = float(way @ (metric * way))
     # of the directions that are known already only their slope at the new place is kept
@@ -141,18 +139,6 @@ def _corrected(near: Near | None, at: Floats, off: Single, prior: Prior) -> Near
     if length < _SHORT**2:
         return moved
     return moved.more(metric * way / length, np.asarray(off - near.of([at])[0], np.float32))
-
-
-def _bent(near: Near, ends: Sequence[tuple[Floats, Single]], prior: Prior) -> Near:
-    """Return what is known after renderings at both ends of the valley, unknowns and differences there: the
-    parabola through these and the middle."""
-    way, metric = ends[1][0] - ends[0][0], np.diag(prior.precision)
-    along = metric * way / float(way @ (metric * way))
-    u = np.array([along @ (x - near.at) for x, _ in ends])
-    rest = [off - near.of([x])[0] for x, off in ends]
-    slope, bend = np.linalg.solve(np.stack([u, u**2], axis=1), np.stack([one.ravel() for one in rest]))
-    shape = near.off.shape
-    return near.more(along, slope.reshape(shape).astype(np.float32), bend.reshape(shape).astype(np.float32))
 
 
 def _strange(found: Fitted, features: Features) -> bool:
@@ -187,15 +173,22 @@ class Valley:
         drawn = np.insert(others, _HELD, modulus, axis=1)
         return np.clip(drawn, prior.ranges[:, 0], prior.ranges[:, 1])
 
-    def ends(self) -> Floats:
-        """Return unknowns (2, 5 + q) far down and up the valley."""
-        return np.asarray(CubicSpline(self.modulus_kPa, self.points)(self._quantile(np.array(_ENDS))))
-
     def _quantile(self, shares: Floats) -> Floats:
         fine = np.linspace(self.modulus_kPa[0], self.modulus_kPa[-1], _FINE)
-        logs = PchipInterpolator(self.modulus_kPa, self.log_density)(fine)  # never above its nodes
+        logs = np.minimum(CubicSpline(self.modulus_kPa, self.log_density)(fine), self.log_density.max() + 0.5)
         below = np.cumsum(np.exp(logs - logs.max()))
         return np.asarray(np.interp(shares, below / below[-1], fine))
+
+
+@dataclass(frozen=True)
+class _Node:
+    """The most probable unknowns (5 + q,) at a modulus, log density there, covariance of the other four, and
+    what is known of the map's error."""
+
+    x: Floats
+    log_density: float
+    spread: Floats
+    near: Near
 
 
 def valley(
@@ -206,42 +199,91 @@ def valley(
     frames: float,
     fitted: Fitted,
     error: Floats,
-    near: Near,
+    off: Callable[[Floats], Single],
     louder: float = 1.0,
-) -> Valley:
+) -> tuple[Valley, int]:
     """Follow the posterior from modulus to modulus, away from the most probable specimen.
 
-    ``louder`` multiplies the noise's variance.
+    Parameters
+    ----------
+    off : by how much pictures are above the chain's at unknowns (5 + q,), by rendering.
+    louder : multiplies the noise's variance.
+
+    Returns
+    -------
+    The valley, and how many specimens were rendered.
     """
-    sd = float(np.sqrt(fitted.covariance[_HELD, _HELD]))
-    top = float(fitted.x[_HELD])
-    low = max(top - _REACH * sd, prior.ranges[_HELD, 0])
-    high = min(top + _REACH * sd, prior.ranges[_HELD, 1])
-    moduli = np.linspace(low, high, _NODES)
-    first = int(np.argmin(np.abs(moduli - top)))
-    rest = np.delete(np.arange(len(fitted.x)), _HELD)
     gain = chain.gain(prior.values(fitted.x))
     told = covariance(chain, features, fitted.pictures, gain, frames, prior.pattern)
     noise = linalg.cho_factor(louder * told + error)
-    slope = fitted.covariance[rest, _HELD] / fitted.covariance[_HELD, _HELD]
-    found: dict[int, tuple[Floats, float, Floats]] = {}
-    begin = fitted.x.copy()
-    begin[rest] += slope * (moduli[first] - top)
-    for way in (range(first, _NODES), range(first - 1, -1, -1)):
-        for node in way:
-            next_ = [found[n][0] for n in (node - 1, node + 1) if n in found]
-            beyond = [found[n][0] for n in (node - 2, node + 2) if n in found]
-            start = begin if not next_ else 2.0 * next_[0] - beyond[0] if beyond else next_[0]
-            start = start.copy()
-            start[_HELD] = moduli[node]
-            found[node] = _held(chain, features, prior, observed, noise, start, rest, near)
-    nodes = [found[n] for n in range(_NODES)]
-    return Valley(
-        moduli,
-        np.array([one[1] for one in nodes]),
-        np.array([one[0] for one in nodes]),
-        np.array([one[2][:4, :4] for one in nodes]),
+    rest = np.delete(np.arange(len(fitted.x)), _HELD)
+    looks = 0
+
+    def node(x: Floats, near: Near | None) -> _Node:
+        nonlocal looks
+        if near is not None:  # as far as the map is off at its neighbour
+            x = _held(chain, features, prior, observed, noise, x, rest, near).x
+        for _ in range(_LOOKS):
+            x = inside(prior, x)
+            near, looks = _flat(x, off(x)), looks + 1
+            found = _held(chain, features, prior, observed, noise, x, rest, near)
+            moved = np.abs(found.x[rest] - x[rest])[:4] / np.sqrt(np.diag(found.spread))
+            x = found.x
+            if moved.max() < _FIRST:
+                break
+        return found
+
+    way = fitted.covariance[:, _HELD] / fitted.covariance[_HELD, _HELD]
+    found: dict[float, _Node] = {}
+
+    def visit(modulus: float) -> _Node:
+        """From the nearest that is known, along the valley as the fit has it."""
+        beside = found[min(found, key=lambda other: abs(other - modulus))] if found else None
+        begin = fitted.x if beside is None else beside.x
+        start = begin + way * (modulus - begin[_HELD])
+        found[modulus] = node(start, None if beside is None else beside.near)
+        return found[modulus]
+
+    low, high = prior.ranges[_HELD]
+    middle, reach = float(fitted.x[_HELD]), _REACH * float(np.sqrt(fitted.covariance[_HELD, _HELD]))
+    top = visit(middle).log_density
+    for sign, room in ((-1.0, middle - low), (1.0, high - middle)):
+        away, fall = min(reach, room), 0.0
+        while away > _SMALL * reach and fall < _ENOUGH:
+            fall = top - visit(middle + sign * away).log_density
+            if away >= room:
+                break
+            away = min(away * float(np.clip(np.sqrt(_FAR / max(fall, 0.1)), 1.5, 4.0)), room)
+    while len(found) < _NODES and (between := _steep(found)) is not None:
+        visit(between)
+    moduli = sorted(found)
+    return (
+        Valley(
+            np.array(moduli),
+            np.array([found[one].log_density for one in moduli]),
+            np.array([found[one].x for one in moduli]),
+            np.array([found[one].spread for one in moduli]),
+        ),
+        looks,
     )
+
+
+def _steep(found: Mapping[float, _Node]) -> float | None:
+    """The middle of the two neighbours between which the density falls most, counted less away from the top;
+    None where it falls little everywhere."""
+    moduli = sorted(found)
+    logs = np.array([found[one].log_density for one in moduli])
+    falls = np.abs(np.diff(logs)) - 2.0 * (logs.max() - np.maximum(logs[1:], logs[:-1]))
+    if len(falls) == 0 or falls.max() < _STEEP:
+        return None
+    place = int(falls.argmax())
+    return 0.5 * (moduli[place] + moduli[place + 1])
+
+
+def _flat(x: Floats, off: Single) -> Near:
+    """What is known from one rendering."""
+    none = np.zeros((0, *off.shape), np.float32)
+    return Near(x, off, np.zeros((0, len(x))), none, none)
 
 
 def _held(
@@ -253,20 +295,27 @@ def _held(
     start: Floats,
     rest: NDArray[np.intp],
     near: Near,
-) -> tuple[Floats, float, Floats]:
-    """Most probable unknowns with the modulus held, log density there, and covariance of the others."""
-    x = start
+) -> _Node:
+    """Most probable unknowns with the modulus held; steps that lead up are halved."""
     precision = prior.precision[np.ix_(rest, rest)]
-    for step in range(_STEPS + 1):
-        x = inside(prior, x)
+    x, least, best = inside(prior, start), np.inf, None
+    for _ in range(_STEPS):
         seen, slopes = jacobian(chain, features, prior, x, near)
-        away = observed - features(seen[None])[0]
+        away, off = observed - features(seen[None])[0], (x - prior.middle)[rest]
+        cost = float(away @ linalg.cho_solve(noise, away) + off @ precision @ off)
+        if best is not None and cost > least:
+            x = inside(prior, 0.5 * (x + best.x))
+            continue
         weighted = linalg.cho_solve(noise, slopes[rest].T)
         inverse = np.linalg.inv(slopes[rest] @ weighted + precision)
-        off = (x - prior.middle)[rest]
-        if step < _STEPS:
-            x = x.copy()
-            x[rest] += inverse @ (weighted.T @ away - precision @ off)
-    cost = away @ linalg.cho_solve(noise, away) + off @ precision @ off
-    # the ranges are flat; their normal stand-in only bounds what the pictures do not tell
-    return x, float(-0.5 * cost + 0.5 * np.linalg.slogdet(inverse)[1]), inverse
+        # the ranges are flat; their normal stand-in only bounds what the pictures do not tell
+        log_density = -0.5 * cost + 0.5 * float(np.linalg.slogdet(inverse)[1])
+        least, best = cost, _Node(x, log_density, inverse[:4, :4], near)
+        step = inverse @ (weighted.T @ away - precision @ off)
+        if np.abs(step / np.sqrt(np.diag(inverse)))[:4].max() < _STILL:
+            break
+        x = x.copy()
+        x[rest] += step
+        x = inside(prior, x)
+    assert best is not None
+    return best
