@@ -20,8 +20,9 @@ demo: $(READY)
 	$(BIN)/twin demo --out $(OUT)
 	@echo "The pictures are in $(OUT); look at $(OUT)/overview.png first."
 
+# Two processes: most tests use one core.
 test: $(READY)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 test-all: $(READY)
 	$(BIN)/python -m pytest -m "slow or not slow" --timeout 3600
