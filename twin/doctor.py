@@ -43,7 +43,7 @@ _MORE = 4  # times as many, where the balance is off by more than
 _ROUGH_PERCENT = 0.15
 _SAMPLE_PATHS = 2**12  # per LED, recorded
 _PLACE_MM = 0.5
-_NOISE_FRAMES, _NOISE_REACH = 8, 7  # pictures, and pixels about the signal, that tell the camera's noise
+_NOISE_FRAMES, _NOISE_REACH = 32, 7  # pictures, and pixels about the signal, that tell the camera's noise
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
