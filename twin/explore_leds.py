@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 from twin import lamp_settings, lamps
 from twin.evaluate import Bench, Evaluation, evaluate
 from twin.report import write_json
+
+if TYPE_CHECKING:
+    from scenes.led import Led
 
 Floats = NDArray[np.float64]
 
@@ -48,7 +51,7 @@ def findings(evaluation: Evaluation) -> dict[str, Any] | None:
         rows.append({**rows[0], "words": f"all at once, {count} times the exposures", "sd": same})
     dark = _rms(lamp_settings.failures(given, ones, names)) if count > 1 else np.zeros((0, len(names)))
     spread = np.quantile(_rms(lamp_settings.binning(given, ones, TOLERANCE, names)), [0.05, 0.95], axis=0)
-    places = [f"{led.side}, {led.coupling}" for led in evaluation.layout.design.leds]
+    places = [_place(led) for led in evaluation.layout.design.leds]
     return {
         "names": names,
         "leds": places,
@@ -57,6 +60,13 @@ def findings(evaluation: Evaluation) -> dict[str, Any] | None:
         "tolerance": TOLERANCE,
         "binning": spread,
     }
+
+
+def _place(led: Led) -> str:
+    """Where an LED is, in words."""
+    if led.side == "below":
+        return f"below at ({led.x_mm:.3g}, {led.y_mm:.3g}) mm"
+    return f"{led.side} at {led.along_mm:.3g} mm, {led.coupling}"
 
 
 def _row(words: str, setting: lamp_settings.Setting, names: tuple[str, ...]) -> dict[str, Any]:

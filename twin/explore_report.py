@@ -204,8 +204,10 @@ def _leds(made: Page, shown: Sequence[Trial]) -> None:
             ]
             for row in found["settings"]
         ]
-        for place, sd in zip(found["leds"], found["dark"], strict=False):
-            rows.append([f"LED at {place}: dark", "", "", "", *(digits(value) for value in sd)])
+        best = found["settings"][1]["intensity"]
+        for place, share, sd in zip(found["leds"], best, found["dark"], strict=False):
+            at_best = f"{digits(share, 2)} in the best"
+            rows.append([f"LED {place}: dark", at_best, "", "", *(digits(value) for value in sd)])
         low, high = found["binning"]
         spread = [f"{digits(a)} to {digits(b)}" for a, b in zip(low, high, strict=True)]
         rows.append([f"bin of ± {100 * found['tolerance']:.0f} %, 9 of 10 sensors", "", "", "", *spread])
