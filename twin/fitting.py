@@ -108,7 +108,7 @@ class Fitted:
 
 @dataclass(frozen=True)
 class Near:
-    """How far rendered pictures are above the chain's around a specimen: off + Σ slope u + bend u², with
+    """How far rendered pictures are above the chain's around a specimen: off + Σ slope u, with
     u = along · (x - at).
 
     Attributes
@@ -116,31 +116,25 @@ class Near:
     at : (5 + q,) the specimen.
     off : (levels, 2, r, c) counts there.
     along : (m, 5 + q) directions in which it is known how that changes.
-    slopes, bends : (m, levels, 2, r, c) how.
+    slopes : (m, levels, 2, r, c) how.
     """
 
     at: Floats
     off: NDArray[np.float32]
     along: Floats
     slopes: NDArray[np.float32]
-    bends: NDArray[np.float32]
 
     def of(self, many: Sequence[Floats]) -> NDArray[np.float32]:
         """Return the difference at unknowns (5 + q,) each, (n, levels, 2, r, c)."""
         u = (np.stack(many) - self.at) @ self.along.T
-        found = self.off + np.tensordot(u, self.slopes, 1) + np.tensordot(u**2, self.bends, 1)
-        return np.asarray(found, np.float32)
+        return np.asarray(self.off + np.tensordot(u, self.slopes, 1), np.float32)
 
-    def more(
-        self, along: Floats, slope: NDArray[np.float32], bend: NDArray[np.float32] | None = None
-    ) -> Near:
+    def more(self, along: Floats, slope: NDArray[np.float32]) -> Near:
         """Return what is known with one more direction."""
-        bends = np.zeros_like(slope) if bend is None else bend
         return replace(
             self,
             along=np.concatenate([self.along, along[None]]),
             slopes=np.concatenate([self.slopes, slope[None]]),
-            bends=np.concatenate([self.bends, bends[None]]),
         )
 
 

@@ -131,11 +131,7 @@ def _corrected(near: Near | None, at: Floats, off: Single, prior: Prior) -> Near
         return _flat(at, off)
     way, metric = at - near.at, np.diag(prior.precision)
     length = float(way @ (metric * way))
-    # of the directions that are known already only their slope at the new place is kept
-    u = near.along @ way
-    shape = (-1, *(1,) * off.ndim)
-    slopes = near.slopes + np.float32(2.0) * u.reshape(shape).astype(np.float32) * near.bends
-    moved = replace(near, at=at, off=off, slopes=slopes)
+    moved = replace(near, at=at, off=off)
     if length < _SHORT**2:
         return moved
     return moved.more(metric * way / length, np.asarray(off - near.of([at])[0], np.float32))
@@ -282,8 +278,7 @@ def _steep(found: Mapping[float, _Node]) -> float | None:
 
 def _flat(x: Floats, off: Single) -> Near:
     """What is known from one rendering."""
-    none = np.zeros((0, *off.shape), np.float32)
-    return Near(x, off, np.zeros((0, len(x))), none, none)
+    return Near(x, off, np.zeros((0, len(x))), np.zeros((0, *off.shape), np.float32))
 
 
 def _held(
