@@ -72,7 +72,7 @@ def assess(
     Parameters
     ----------
     samples : how many at most; of the group "test" where there is one.
-    rendered : whether answers are refined by rendering, too: half a minute a sample.
+    rendered : whether answers are refined by rendering, too: a minute or two a sample.
 
     Raises
     ------

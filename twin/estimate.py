@@ -79,7 +79,7 @@ def estimate(
     frames, references, exposures, flip : as of `twin.receiving.receive`.
     out : folder to make for `RECORD` and `PICTURE`; None for none.
     samples, seed : of the posterior.
-    rendered : whether the network's answer is refined by rendering, some ten seconds.
+    rendered : whether the network's answer is refined by rendering, half a minute.
 
     Raises `DesignError`, before anything is written, for pictures that cannot be read, do not fit the model,
     or are unlike those that it was trained for.
