@@ -21,8 +21,8 @@ _ASSESS = """\
 Answer every inclusion of a corpus that a model has not seen (its group named test, else all), from one
 exposure and from the mean of 100, by the network and refined by rendering, and compare with the truth and
 with the smallest error that the pictures allow. Writes report.html, assessment.json and assessment.png. A
-corpus of the same sensor made by full solves or with other light tells what a mismatch costs. A minute or two a
-sample and core; every answer is kept: the same command goes on, also after Ctrl-C. With --curve, a learning
+corpus of the same sensor made by full solves or with other light tells what a mismatch costs. A minute or two
+a sample and core; every answer is kept: the same command goes on, also after Ctrl-C. With --curve, a learning
 curve of the light map, which the report of the same DIR shows, too.
 
 examples:

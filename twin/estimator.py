@@ -73,7 +73,7 @@ class Estimator:
     ) -> Estimate:
         """Return what is known after the pictures; ``samples`` of the posterior are drawn from ``seed``.
 
-        The network's answer is refined by rendering (`refining.refine`; half a minute), unless ``rendered`` is
+        The network's answer is refined by rendering (`refining.refine`, half a minute) unless ``rendered`` is
         False, the pictures are refused or hold no inclusion, or what is rendered does not explain them, even
         if the camera stands a little off.
         """
