@@ -71,6 +71,16 @@ def test_one_repeat_has_no_spread() -> None:
         _ = one.answers
 
 
+def test_the_noise_of_paths_is_not_cut_off() -> None:
+    """Pixels over the full well count in full: cut off on one side, noise would pass for a weaker answer."""
+    one = follower()
+    camera = one._small.camera
+    bright = np.full((2, *camera.shape), 1e3)
+    counts = one._counts(bright)
+    assert counts.min() > camera.full_well_e / camera.gain_e_per_dn
+    assert one._counts(2.0 * bright) == pytest.approx(2.0 * counts, rel=1e-9)
+
+
 def test_paths_that_it_takes() -> None:
     """Ten times the noise that is asked for takes a hundred times the paths; words hold the ratio."""
     followed = np.array([[1.0], [3.0], [2.0]])

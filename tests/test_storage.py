@@ -25,6 +25,7 @@ class Server:
     """A database server: its commands, where Debian keeps them, and how it is set up, started and stopped."""
 
     name: str
+    package: str
     url: str
     commands: tuple[str, ...]
     folders: str
@@ -39,9 +40,7 @@ class Server:
             for name in self.commands
         ]
         if None in found:
-            pytest.skip(
-                f"{self.name}'s server is not installed (Debian: apt-get install {self.name.lower()})"
-            )
+            pytest.skip(f"{self.name}'s server is not installed (Debian: apt-get install {self.package})")
         return tuple(map(str, found))
 
 
@@ -68,6 +67,7 @@ def init_maria(home: Path, commands: tuple[str, ...], options: dict[str, Any]) -
 SERVERS = (
     Server(
         "PostgreSQL",
+        "postgresql",
         "postgresql://designer:secret@127.0.0.1:{port}/postgres",
         ("initdb", "postgres"),
         "lib/postgresql/*/bin",
@@ -88,6 +88,7 @@ SERVERS = (
     ),
     Server(
         "MariaDB",
+        "mariadb-server",
         "mysql+pymysql://designer:secret@127.0.0.1:{port}/studies",
         ("mariadb-install-db", "mariadbd"),
         "sbin",
