@@ -52,12 +52,19 @@ class Table:
         return mi.TensorXf(packed)
 
     def transmittance(self, fraction: mi.Float, cosine: mi.Float, active: mi.Bool | bool = True) -> mi.Float:
+        return self.steep(fraction, cosine, active)[0]
+
+    def steep(
+        self, fraction: mi.Float, cosine: mi.Float, active: mi.Bool | bool = True
+    ) -> tuple[mi.Float, mi.Float]:
+        """Transmittance, and its derivative to the contact fraction."""
         i, u = _cell(fraction, self.rows)
         j, v = _cell(cosine, self.columns)
         corner = i * self.columns + j
         t00, t01 = (dr.gather(mi.Float, self._t, corner + k, active) for k in (0, 1))
         t10, t11 = (dr.gather(mi.Float, self._t, corner + self.columns + k, active) for k in (0, 1))
-        return dr.lerp(dr.lerp(t00, t01, v), dr.lerp(t10, t11, v), u)
+        low, high = dr.lerp(t00, t01, v), dr.lerp(t10, t11, v)
+        return dr.lerp(low, high, u), (high - low) * (self.rows - 1)
 
     def hemispherical(self, fraction: mi.Float, active: mi.Bool | bool = True) -> mi.Float:
         return self._row(self._mean, fraction, active)

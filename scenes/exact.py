@@ -8,6 +8,7 @@ Import only after a variant is set (`scenes.backend.use`).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -90,15 +91,17 @@ class _View:
     rows: int
     columns: int
     width: float
+    many: int
     layers: mi.Int64
 
     @staticmethod
-    def of(film: Film, sensor: Sensor) -> _View:
+    def of(film: Film, sensor: Sensor, many: int = 1) -> _View:
+        """A view that collects so many numbers in each pixel of each LED."""
         rows, columns = film.area_mm2.shape
         stacked = np.concatenate([film.film, film.lean], axis=-1).astype(np.float32)
         maps = mi.Texture2f(mi.TensorXf(stacked), wrap_mode=dr.WrapMode.Clamp)
-        layers = dr.zeros(mi.Int64, len(sensor.leds) * rows * columns)
-        return _View(maps, rows, columns, sensor.guide.width_mm, layers)
+        layers = dr.zeros(mi.Int64, len(sensor.leds) * rows * columns * many)
+        return _View(maps, rows, columns, sensor.guide.width_mm, many, layers)
 
     def _look_up(self, x: mi.Float, y: mi.Float) -> list[mi.Float]:
         # nodes sit at the ends of the face, a texture's in the middle of its texels
@@ -110,14 +113,21 @@ class _View:
         _, _, lean_x, lean_y = self._look_up(point.x, point.y)
         return mi.Vector3f(-lean_x, -lean_y, -1.0)
 
-    def add(self, number: mi.UInt32, point: mi.Point3f, amount: mi.Float, active: mi.Bool) -> None:
-        """Count an amount at the pixel that sees a point."""
+    def add(self, number: mi.UInt32, point: mi.Point3f, amounts: Sequence[mi.Float], active: mi.Bool) -> None:
+        """Count amounts at the pixel that sees a point."""
         lean = self.towards(point)
         column, row, _, _ = self._look_up(point.x + point.z * lean.x, point.y + point.z * lean.y)
         inside = active & (column >= 0.0) & (column < self.columns) & (row >= 0.0) & (row < self.rows)
         pixel = mi.UInt32(dr.maximum(row, 0.0)) * self.columns + mi.UInt32(dr.maximum(column, 0.0))
-        fixed = mi.Int64(dr.round(amount * _FIXED_POINT))
-        dr.scatter_add(self.layers, fixed, number * (self.rows * self.columns) + pixel, inside)
+        place = (number * (self.rows * self.columns) + pixel) * self.many
+        for k, amount in enumerate(amounts):
+            fixed = mi.Int64(dr.round(amount * _FIXED_POINT))
+            dr.scatter_add(self.layers, fixed, place + k, inside)
+
+    def collected(self) -> Array:
+        """All that was counted, (many, n_led, rows, columns)."""
+        found = self.layers.numpy().reshape(-1, self.rows, self.columns, self.many)
+        return np.moveaxis(found, -1, 0) / _FIXED_POINT
 
 
 def exact(
@@ -130,6 +140,7 @@ def exact(
     seed: int,
     *,
     local: bool = False,
+    slopes: Array | None = None,
 ) -> Array:
     """What the camera sees directly, and mirrored once in the lower faces, without the ways between.
 
@@ -144,20 +155,27 @@ def exact(
     local
         Take tissue for the diffuse lobe of the scene's BSDF, which sends light back where it came in: what
         stock `path` sees.
+    slopes
+        Derivatives of `fraction` to q parameters, (q, m, m): what is seen is followed by its derivatives, by
+        the paths' scores (`wander.Spots`). Not with `local`.
 
     Returns
     -------
-    (2, n_led, rows, columns)
+    (2, n_led, rows, columns), or with slopes (1 + q, 2, n_led, rows, columns)
         Radiance in the guide that leaves the surface towards each pixel, W mm⁻² sr⁻¹: straight, and by the
         lower faces and the contact surface, whose reflectances are left out.
     """
+    if local and slopes is not None:
+        raise ValueError("slopes: received some with local; allowed only without")
+    per = np.ones(0) if slopes is None else np.maximum(np.abs(slopes).max(axis=(1, 2)), 1e-30)
+    even = None if slopes is None else slopes / per[:, None, None]  # of like size: digits do not run out
     n_led = len(sensor.leds)
     films = [Film.at(sensor, rays, height) for height in (0.0, mirrored_run_mm(sensor))]
-    views = [_View.of(film, sensor) for film in films]
+    views = [_View.of(film, sensor, 1 + per.size) for film in films]
     contact = next(shape for shape in scene.shapes() if shape.id() == "contact")
     faces = Faces(scene, sensor)
     context = mi.BSDFContext(mi.TransportMode.Importance)
-    spots = mi.Texture2f(mi.TensorXf(fraction[..., None].astype(np.float32)), wrap_mode=dr.WrapMode.Clamp)
+    spots = wander.Spots.of(sensor, fraction, even)
     squeezed = (sensor.guide.refractive_index / sensor.tissue.refractive_index) ** 2
 
     index = dr.arange(mi.UInt32, n_led * samples)
@@ -167,10 +185,10 @@ def exact(
     sequence = dr.arange(mi.UInt64, n_led * samples) + 1
     random = mi.PCG32(size=n_led * samples, initstate=dr.opaque(mi.UInt64, seed), initseq=sequence)
 
-    def going(ray, throughput, bounce, alive, random):  # type: ignore[no-untyped-def]
+    def going(ray, throughput, bounce, alive, random, *scores):  # type: ignore[no-untyped-def]
         return alive
 
-    def step(ray, throughput, bounce, alive, random):  # type: ignore[no-untyped-def]
+    def step(ray, throughput, bounce, alive, random, *scores):  # type: ignore[no-untyped-def]
         met = faces.meet(ray, alive)
         for lost in trace.absorb(sensor, ray, met, throughput).values():
             throughput = throughput - lost
@@ -178,7 +196,7 @@ def exact(
         touches = alive & (met.kind == CONTACT) & (met.cosine > 0.0)
         u1, u2 = random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32())
         direction, share = trace.bounce_off(sensor, faces, met, alive & ~touches, u1, u2)
-        through = table.transmittance(met.fraction, met.cosine, touches)
+        through, steep = table.steep(met.fraction, met.cosine, touches)
         if local:
             # what leaves towards the camera is known before it is drawn
             glow = throughput * through * dr.inv_pi
@@ -188,7 +206,7 @@ def exact(
                 off_unit = off * dr.rcp(dr.norm(down))
                 seen = table.transmittance(met.fraction, off_unit, touches)
                 seen *= table.diffuse(met.fraction, met.cosine, off_unit, touches)
-                view.add(number, met.p, glow * seen * dr.dot(met.n, down), touches & (off > 0.0))
+                view.add(number, met.p, [glow * seen * dr.dot(met.n, down)], touches & (off > 0.0))
             si = scene.ray_intersect(ray, touches)
             scattered, weight = si.bsdf(ray).sample(context, si, u1, u2, touches)
             direction = dr.select(touches, si.to_world(scattered.wo), direction)
@@ -198,27 +216,33 @@ def exact(
             following = met.leaving(dr.select(touches, met.mirrored, direction))
             share = dr.select(touches, 1.0, share)
             enters = touches & (u1 < through)
-            back, left, random = wander.wander(
-                sensor, table, spots, views, met, number, throughput, enters, random
+            chosen = spots.scores(met.p, through, steep, enters)
+            scores = tuple(
+                one + dr.select(touches, new, 0.0) for one, new in zip(scores, chosen, strict=True)
+            )
+            back, left, random, scores = wander.wander(
+                sensor, table, spots, views, met, number, throughput, enters, random, scores
             )
             share = dr.select(enters, left, share)
             following = dr.select(enters, _come_back(scene, contact, back), following)
         kept = throughput * share
         survive = dr.select(bounce < _SURE_BOUNCES, 1.0, dr.minimum(kept, 0.95))
         alive = alive & (kept > 0.0) & (random.next_float32() < survive) & (bounce < _MAX_BOUNCES)
-        return following, dr.select(alive, kept / survive, 0.0), bounce + 1, alive, random
+        return following, dr.select(alive, kept / survive, 0.0), bounce + 1, alive, random, *scores
 
     begin = (trace.emit(sensor, number, trace.evenly(place, starts)), dr.full(mi.Float, 1.0, n_led * samples))
-    dr.while_loop((*begin, mi.UInt32(0), mi.Bool(True), random), going, step)
-    scale = np.array([led.flux_W for led in sensor.leds])[:, None, None] / samples / _FIXED_POINT * squeezed
-    if local:
-        scale = scale / squeezed
-    return np.stack(
-        [
-            scale * view.layers.numpy().reshape(n_led, view.rows, view.columns) / film.area_mm2
-            for view, film in zip(views, films, strict=True)
-        ]
+    still = [dr.zeros(mi.Float, n_led * samples) for _ in per]
+    dr.while_loop((*begin, mi.UInt32(0), mi.Bool(True), random, *still), going, step)
+    scale = np.array([led.flux_W for led in sensor.leds])[:, None, None] / samples
+    if not local:
+        scale = scale * squeezed
+    found = np.stack(
+        [scale * view.collected() / film.area_mm2 for view, film in zip(views, films, strict=True)], axis=1
     )
+    if slopes is None:
+        return found[0]
+    found[1:] *= per[:, None, None, None, None]
+    return found
 
 
 def mirrored_run_mm(sensor: Sensor) -> float:

@@ -19,9 +19,13 @@ from .ftir import gap_transmittance
 Array = NDArray[np.float64]
 Passing = Callable[[mi.Point3f, mi.Float], mi.Float]
 """Transmittance of the face at points (z = 0) for light from inside at a cosine, both on the device."""
-Witness = Callable[[mi.Point3f, mi.Vector3f, mi.Float, mi.Float, mi.Bool], None]
-"""Told of every collision: where, direction before it, share of the light after it, mean cosine g, and which
-lanes collide."""
+Scores = tuple[mi.Float, ...]
+"""Of each parameter the derivative of the logarithm of a path's density."""
+Witness = Callable[[mi.Point3f, mi.Vector3f, mi.Float, mi.Float, mi.Bool, Scores], None]
+"""Told of every collision: where, direction before it, share of the light after it, mean cosine g, which
+lanes collide, and the scores so far."""
+Scoring = Callable[[mi.Point3f, mi.Float, mi.Bool, mi.Bool], Scores]
+"""What a meeting with the face adds to scores: where, cosine, whether light leaves, and which lanes meet."""
 
 _FIXED_POINT = float(
     2**20
@@ -125,7 +129,7 @@ def walk(
             mi.Vector3f, photons
         )
     where = dr.zeros(mi.Point3f, photons)
-    where, direction, weight, through, _ = roam(body, where, direction, random, fresnel(*indices))
+    where, direction, weight, through, _, _ = roam(body, where, direction, random, fresnel(*indices))
 
     lot = dr.arange(mi.UInt32, photons) % _LOTS
     rings = mi.Float(np.concatenate([[0.0], edges]).astype(np.float32))
@@ -158,7 +162,9 @@ def roam(
     passing: Passing,
     active: mi.Bool | bool = True,
     witness: Witness | None = None,
-) -> tuple[mi.Point3f, mi.Vector3f, mi.Float, mi.Float, mi.PCG32]:
+    scores: Scores = (),
+    scoring: Scoring | None = None,
+) -> tuple[mi.Point3f, mi.Vector3f, mi.Float, mi.Float, mi.PCG32, Scores]:
     """Follow light from points on or below the face until it leaves or is absorbed.
 
     Free paths are drawn for the densest medium; what collides elsewhere does so in proportion (delta
@@ -174,6 +180,8 @@ def roam(
         Share that was lost at the slab's other face.
     random
         Random numbers for what comes next.
+    scores
+        What they began with, and what `scoring` added.
     """
     lanes = dr.width(where)
     medium, ball = body.medium, body.ball
@@ -186,10 +194,10 @@ def roam(
         kept_in, real_in, g_in = (dr.opaque(mi.Float, v) for v in _collision(ball.medium, majorant))
     isotropic = medium.anisotropy == 0.0 and (ball is None or ball.medium.anisotropy == 0.0)
 
-    def going(where, direction, weight, through, alive, step, random):  # type: ignore[no-untyped-def]
+    def going(where, direction, weight, through, alive, step, random, *scores):  # type: ignore[no-untyped-def]
         return alive
 
-    def on(where, direction, weight, through, alive, step, random):  # type: ignore[no-untyped-def]
+    def on(where, direction, weight, through, alive, step, random, *scores):  # type: ignore[no-untyped-def]
         up = direction.z < 0.0
         free = -dr.log(1.0 - random.next_float32()) * longest
         face = dr.select(up, -where.z, bottom - where.z) / direction.z
@@ -214,7 +222,10 @@ def roam(
         collides = ~meets & (u3 < chance)
         weight = dr.select(collides, weight * share, weight)
         if witness is not None:
-            witness(where, direction, weight, mean, alive & collides)
+            witness(where, direction, weight, mean, alive & collides, scores)
+        if scoring is not None:
+            more = scoring(where, -direction.z, leaves, alive & at_face)
+            scores = tuple(one + new for one, new in zip(scores, more, strict=True))
         turned = mi.Frame3f(direction).to_world(_scattered(mean, u1, u2, isotropic))
         thrown = mi.warp.square_to_cosine_hemisphere(mi.Point2f(u1, u2))
         lambert = mi.Vector3f(thrown.x, thrown.y, -dr.maximum(thrown.z, 1e-6))
@@ -228,7 +239,7 @@ def roam(
         weight = dr.select(random.next_float32() < survives, weight / survives, 0.0)
         weight = dr.select(step < _MOST_STEPS, weight, 0.0)
         alive = alive & ~leaves & (weight > 0.0)
-        return where, direction, weight, through, alive, step + 1, random
+        return where, direction, weight, through, alive, step + 1, random, *scores
 
     state = (
         mi.Point3f(where),
@@ -238,9 +249,11 @@ def roam(
         dr.full(mi.Bool, True, lanes) & active,
         dr.zeros(mi.UInt32, lanes),
         random,
+        *scores,
     )
-    where, direction, weight, through, _, _, random = dr.while_loop(state, going, on, labels=_STATE)
-    return where, direction, weight, through, random
+    labels = (*_STATE, *(f"score_{number}" for number in range(len(scores))))
+    where, direction, weight, through, _, _, random, *scored = dr.while_loop(state, going, on, labels=labels)
+    return where, direction, weight, through, random, tuple(scored)
 
 
 def fresnel(n_body: float, n_before: float) -> Passing:

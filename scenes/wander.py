@@ -8,15 +8,20 @@ Import only after a variant is set (`scenes.backend.use`).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
 
 from .bsdf import Table
 from .faces import Meeting
 from .sensor import Sensor
-from .walk import Body, Medium, roam
+from .walk import Body, Medium, Scores, roam
+
+_LEAST = 1e-6  # of a chance that is divided by: what is rarer never happens
 
 
 class View(Protocol):
@@ -25,8 +30,54 @@ class View(Protocol):
     def towards(self, point: mi.Point3f) -> mi.Vector3f:
         """Direction, down, from a point to the viewer, with z = -1."""
 
-    def add(self, number: mi.UInt32, point: mi.Point3f, amount: mi.Float, active: mi.Bool) -> None:
-        """Count an amount that leaves at a point."""
+    def add(self, number: mi.UInt32, point: mi.Point3f, amounts: Sequence[mi.Float], active: mi.Bool) -> None:
+        """Count an amount that leaves at a point, and its derivatives."""
+
+
+@dataclass(frozen=True)
+class Spots:
+    """Real contact fraction over the guide's face, and its derivatives to parameters.
+
+    Light's choices at the contact hang on the fraction alone, so that a picture's derivative is the mean of
+    what paths carry times the derivative of the logarithm of their density, their score (the likelihood
+    ratio method: Glynn 1990; [glynn1990]): no second set of paths is followed, and none part ways.
+    """
+
+    fraction: mi.Texture2f
+    slopes: mi.Texture2f | None
+    width_mm: float
+
+    @staticmethod
+    def of(sensor: Sensor, fraction: NDArray[np.float64], slopes: NDArray[np.float64] | None) -> Spots:
+        """From maps [iy, ix] (m, m) and (q, m, m) over the guide's face."""
+        maps = [
+            None if one is None else mi.Texture2f(mi.TensorXf(one), wrap_mode=dr.WrapMode.Clamp)
+            for one in (
+                fraction[..., None].astype(np.float32),
+                None if slopes is None else np.moveaxis(slopes, 0, -1).astype(np.float32),
+            )
+        ]
+        return Spots(maps[0], maps[1], sensor.guide.width_mm)
+
+    def at(self, point: mi.Point3f) -> mi.Float:
+        """Contact fraction."""
+        return self.fraction.eval(self._place(point))[0]
+
+    def derivatives(self, point: mi.Point3f) -> list[mi.Float]:
+        """Of the contact fraction, to each parameter."""
+        return [] if self.slopes is None else list(self.slopes.eval(self._place(point)))
+
+    def scores(self, point: mi.Point3f, through: mi.Float, steep: mi.Float, passes: mi.Bool) -> Scores:
+        """Derivatives of the logarithm of the chance of what light did that met a transmittance."""
+        if self.slopes is None:
+            return ()
+        relative = dr.select(
+            passes, steep / dr.maximum(through, _LEAST), -steep / dr.maximum(1.0 - through, _LEAST)
+        )
+        return tuple(relative * slope for slope in self.derivatives(point))
+
+    def _place(self, point: mi.Point3f) -> mi.Point2f:
+        return mi.Point2f(point.x / self.width_mm + 0.5, point.y / self.width_mm + 0.5)
 
 
 def body_of(sensor: Sensor) -> Body:
@@ -43,22 +94,23 @@ def body_of(sensor: Sensor) -> Body:
 def wander(
     sensor: Sensor,
     table: Table,
-    spots: mi.Texture2f,
+    spots: Spots,
     views: Sequence[View],
     met: Meeting,
     number: mi.UInt32,
     throughput: mi.Float,
     enters: mi.Bool,
     random: mi.PCG32,
-) -> tuple[mi.Ray3f, mi.Float, mi.PCG32]:
+    scores: Scores = (),
+) -> tuple[mi.Ray3f, mi.Float, mi.PCG32, Scores]:
     """Follow light that enters where it `met` the contact until it leaves; views see every collision.
 
     Returns
     -------
     The ray that leaves (in the guide, from the plane through there), the share of the light that it carries,
-    0 where all is absorbed, and the state of the random numbers.
+    0 where all is absorbed, the state of the random numbers, and the scores that `scores` grew to.
     """
-    body, width = body_of(sensor), sensor.guide.width_mm
+    body = body_of(sensor)
     index = sensor.guide.refractive_index / behind(sensor)
     frame = mi.Frame3f(met.normal)
     here = frame.to_local(met.d)
@@ -66,15 +118,21 @@ def wander(
     def world(place: mi.Point3f) -> mi.Point3f:
         return met.p + frame.to_world(mi.Vector3f(place.x, place.y, -place.z))
 
-    def fraction_at(point: mi.Point3f) -> mi.Float:
-        return spots.eval(mi.Point2f(point.x / width + 0.5, point.y / width + 0.5))[0]
+    def steep(where: mi.Point3f, cosine: mi.Float) -> tuple[mi.Float, mi.Float]:
+        square = 1.0 - (1.0 - dr.square(cosine)) / index**2
+        found = table.steep(spots.at(world(where)), dr.safe_sqrt(square))
+        return tuple(dr.select(square > 0.0, one, 0.0) for one in found)
 
     def passing(where: mi.Point3f, cosine: mi.Float) -> mi.Float:
-        square = 1.0 - (1.0 - dr.square(cosine)) / index**2
-        through = table.transmittance(fraction_at(world(where)), dr.safe_sqrt(square))
-        return dr.select(square > 0.0, through, 0.0)
+        return steep(where, cosine)[0]
 
-    def witness(where: mi.Point3f, way: mi.Vector3f, share: mi.Float, g: mi.Float, collides: mi.Bool) -> None:
+    def scoring(where: mi.Point3f, cosine: mi.Float, leaves: mi.Bool, meets: mi.Bool) -> Scores:
+        added = spots.scores(world(where), *steep(where, cosine), leaves)
+        return tuple(dr.select(meets, one, 0.0) for one in added)
+
+    def witness(
+        where: mi.Point3f, way: mi.Vector3f, share: mi.Float, g: mi.Float, collides: mi.Bool, so_far: Scores
+    ) -> None:
         for view in views:
             down = view.towards(world(where))
             length = dr.norm(down)
@@ -83,18 +141,23 @@ def wander(
             up = dr.safe_sqrt(1.0 - dr.square(aim_x) - dr.square(aim_y))
             run = where.z / dr.maximum(up, 1e-6)
             leaves = world(where + run * mi.Vector3f(aim_x, aim_y, -up))
-            seen = table.transmittance(fraction_at(leaves), out.z, collides) * out.z * length
+            through, slope = table.steep(spots.at(leaves), out.z, collides)
             bend = phase(g, dr.dot(way, mi.Vector3f(aim_x, aim_y, -up)))
             amount = throughput * share * bend * dr.exp(-body.medium.extinction_per_mm * run) / up
-            view.add(number, leaves, amount * seen, collides & (out.z > 0.0) & (up > 0.0))
+            amount *= out.z * length
+            changes = zip(so_far, spots.derivatives(leaves), strict=True)
+            slopes = [amount * (through * score + slope * change) for score, change in changes]
+            view.add(number, leaves, [amount * through, *slopes], collides & (out.z > 0.0) & (up > 0.0))
 
     flat = mi.Vector2f(here.x, here.y) * index
     way = mi.Vector3f(flat.x, flat.y, dr.safe_sqrt(1.0 - dr.squared_norm(flat)))
     start = dr.zeros(mi.Point3f, dr.width(number))
-    where, way, share, _, random = roam(body, start, way, random, passing, enters, witness)
+    where, way, share, _, random, scores = roam(
+        body, start, way, random, passing, enters, witness, scores, scoring if scores else None
+    )
     flat = mi.Vector2f(way.x, way.y) / index
     out = mi.Vector3f(flat.x, flat.y, dr.safe_sqrt(1.0 - dr.squared_norm(flat)))
-    return mi.Ray3f(world(where), frame.to_world(out)), share, random
+    return mi.Ray3f(world(where), frame.to_world(out)), share, random, scores
 
 
 def behind(sensor: Sensor) -> float:

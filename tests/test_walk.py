@@ -140,7 +140,7 @@ def test_spread_is_the_walk_under_a_face_that_changes_from_place_to_place(
     u, s, t = (random.next_float32() for _ in range(3))
     start = mi.Point3f(4.0 * (u - 1.0), 0.0, 0.0)
     down = mi.warp.square_to_cosine_hemisphere(mi.Point2f(s, t))
-    place, _, weight, _, _ = steps.roam(
+    place, _, weight, _, _, _ = steps.roam(
         steps.Body(steps.Medium(1.0, 0.02)),
         start,
         down,
@@ -189,7 +189,7 @@ def test_trapped_light_comes_back_to_the_camera_as_the_walk_says(steps: ModuleTy
     inward = mi.Vector3f(sine * along, sine * across, dr.sqrt(1.0 - sine * sine))
     face = steps.behind_guide(N3, N1, lambda where, cos: table.transmittance(share, cos))
     body = steps.Body(steps.Medium(1.0, 0.02))
-    _, leaves, weight, _, _ = steps.roam(body, dr.zeros(mi.Point3f, photons), inward, random, face)
+    _, leaves, weight, _, _, _ = steps.roam(body, dr.zeros(mi.Point3f, photons), inward, random, face)
     light = np.array(weight * table.transmittance(share, cosine), dtype=float) / photons
     outside = 1.0 - (N3 / N1) ** 2 * (
         1.0 - np.array(leaves.z, dtype=float) ** 2
@@ -282,7 +282,9 @@ def test_light_that_enters_aslant_comes_out_ahead(steps: ModuleType, variant: st
     def moments(way: Any, random: Any) -> tuple[np.ndarray, np.ndarray]:
         """Mean x, mean x² - y², mean x² + y² of what leaves, and their errors."""
         body = steps.Body(steps.Medium(1.0, 0.02))
-        place, _, weight, _, _ = steps.roam(body, 0.0 * mi.Point3f(way), way, random, steps.fresnel(1.0, 1.0))
+        place, _, weight, _, _, _ = steps.roam(
+            body, 0.0 * mi.Point3f(way), way, random, steps.fresnel(1.0, 1.0)
+        )
         x, y, share = (np.asarray(v, dtype=np.float64) for v in (place.x, place.y, weight))
         values = np.stack([x, x**2 - y**2, x**2 + y**2])
         mean = (share * values).mean(axis=1) / share.mean()

@@ -175,7 +175,7 @@ def evaluate(
         layout, small = replace(layout, design=design), pixels.coarse(design, bench.cell_mm)[0]
         work.design = small
     judged = [
-        _judged(small, block, protocol, inclusion, every, lit)
+        judge(small, block, protocol, inclusion, every, lit)
         for inclusion, lit in zip(inclusions, light, strict=True)
     ]
     seconds["information"] += time.perf_counter() - began
@@ -213,7 +213,7 @@ def check(layout: Layout, inclusions: Sequence[fem.Inclusion]) -> None:
             layout.design.check_inclusion(replace(inclusion, offset=offset))
 
 
-def _judged(
+def judge(
     design: Design,
     block: float,
     protocol: Protocol,
