@@ -206,15 +206,17 @@ def test_derivatives_agree_with_other_steps(emulator: fem.Emulator) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_bounds_hardly_know_of_the_light_s_noise(emulator: fem.Emulator) -> None:
-    """Twice the light paths, and another seed: bounds on d, h and E within 5 %."""
+    """Twice the light paths, and another seed: all bounds within 5 %, those on d, h and E within 1.5 %."""
+    from twin.bench import PATHS
     from twin.evaluate import Bench, Layout, Protocol, evaluate
 
     layout = Layout(shipped(), Protocol((2.0,)), {})
     found = []
-    for samples, seed in ((2**17, 0), (2**18, 0), (2**17, 1)):
+    for samples, seed in ((PATHS, 0), (2 * PATHS, 0), (PATHS, 1)):
         bench = Bench(cell_mm=0.5, samples=samples)
         one = evaluate(layout, [BALL], emulator=emulator, seed=seed, detection=False, bench=bench)
         found.append(np.array(list(one.judged[0].sd.values())))
     change = np.array(found[1:]) / found[0] - 1
     print("bounds, %:", np.round(100 * change, 2))
-    assert np.abs(change[:, :3]).max() < 0.05
+    assert np.abs(change).max() < 0.05
+    assert np.abs(change[:, :3]).max() < 0.015
