@@ -291,9 +291,16 @@ def test_the_command_explores(tmp_path: Path) -> None:
     assert plan.returncode == 0, plan.stderr
     assert "counts alone" in plan.stdout and "measured" in plan.stdout
     done = subprocess.run(
-        [*command, "--out", str(tmp_path / "out")], capture_output=True, text=True, cwd=root
+        [*command, "--out", str(tmp_path / "out"), "--confirm", "0.01"],
+        capture_output=True,
+        text=True,
+        cwd=root,
     )
     assert done.returncode == 0, done.stderr
+    confirmed = json.loads((tmp_path / "out" / "confirmed.json").read_text())
+    assert all(line in done.stdout for line in confirmed["lines"])
+    assert "E at least" in confirmed["lines"][2]
+    assert "followed ray by ray" in (tmp_path / "out" / "report.html").read_text()
     found = json.loads((tmp_path / "out" / "trials" / "0000" / "evaluation.json").read_text())
     assert 0 < found["objectives"]["bound_modulus_kPa"] < 23.0
 

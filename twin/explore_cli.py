@@ -46,7 +46,7 @@ def add(verbs: Any) -> None:
         "--confirm",
         type=number(above=0.0),
         metavar="MINUTES",
-        help="then follow light ray by ray through the base and the layout that tells E best",
+        help="then bounds of the base and of the layout that tells E best in light followed ray by ray",
     )
 
 
@@ -84,7 +84,8 @@ def run(arguments: argparse.Namespace) -> int:
             tell.close()
             print("twin explore: interrupted; what is finished stays, run again continues", file=sys.stderr)
             return 130
-    print(f"{state.complete} layouts judged, {state.infeasible} that cannot be: {arguments.out}")
+    many = "1 layout" if state.complete == 1 else f"{state.complete} layouts"
+    print(f"{many} judged, {state.infeasible} that cannot be: {arguments.out}")
     for line in explore_words.findings(found):
         print(line)
     from twin import explore_report
@@ -99,7 +100,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _confirm(found: Exploration, minutes: float) -> None:
-    """Print how the base and the best layout answer to E by the reference quality; DIR/confirmed.json."""
+    """Print the bounds of the base and the best layout in light followed ray by ray; DIR/confirmed.json."""
     from twin import confirm, explore_report, explore_words, layout_fields, presses
     from twin.reporting import Reporter
 

@@ -25,22 +25,29 @@ UNITS = {"size_mm": ("d", "mm", 1.0), "depth_mm": ("h", "mm", 1.0), "modulus_kPa
 
 
 def layouts(
-    trials: Sequence[Trial], noises: Sequence[Noise], extent_mm: Sequence[tuple[float, float]]
+    trials: Sequence[Trial],
+    noises: Sequence[Noise],
+    extent_mm: Sequence[tuple[float, float]],
+    presses: Sequence[tuple[int, float]],
 ) -> Figure:
     """Draw each layout's picture, its tared picture and what a step of d, h and E does, over the noise.
 
-    ``noises`` is of one true pixel of each layout, ``extent_mm`` width and height that its pictures show.
+    ``noises`` is of one true pixel of each layout, ``extent_mm`` width and height that its pictures show,
+    ``presses`` the number and the depth (mm) of the press that is shown.
     """
     rows = len(trials)
     figure = Figure(figsize=(10.4, 1.75 * rows + 0.45), facecolor="white", layout="constrained")
     figure.get_layout_engine().set(w_pad=0.02, h_pad=0.03)
     axes: Any = figure.subplots(rows, 5, squeeze=False)
     held = []
-    for trial, noise in zip(trials, noises, strict=True):
+    for trial, noise, (press, _) in zip(trials, noises, presses, strict=True):
         counts, slopes = trial.pictures()
-        mean = _grey(counts, 3)
+        at = 2 * press  # its reference follows
+        mean = _grey(counts, 3)[at : at + 2]
         weight = np.sqrt(pixel_information(mean[0], noise))
-        maps = {name: UNITS[name][2] * _grey(slopes[name], 3)[0] * weight for name in UNITS if name in slopes}
+        maps = {
+            name: UNITS[name][2] * _grey(slopes[name], 3)[at] * weight for name in UNITS if name in slopes
+        }
         held.append((mean, maps))
     ends = {
         name: max(
@@ -69,7 +76,8 @@ def layouts(
                 )
                 bar.ax.tick_params(labelsize=8)
                 bar.outline.set_visible(False)
-        axes[row, 0].set_ylabel(trial.name, fontsize=10, color=COLOURS[row % len(COLOURS)], fontweight="bold")
+        label = f"{trial.name}\n{presses[row][1]:g} mm"
+        axes[row, 0].set_ylabel(label, fontsize=10, color=COLOURS[row % len(COLOURS)], fontweight="bold")
         for column in range(len(drawn), 5):
             axes[row, column].set_visible(False)
     heads = ["picture, counts", "tared, counts"]

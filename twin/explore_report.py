@@ -64,7 +64,8 @@ def page(results: Results) -> Page:
     """Return the report of a study."""
     mattered = importances(results)
     best = results.best()
-    tried = f"{len(results.trials)} layouts judged"
+    many = len(results.trials)
+    tried = f"{many} layout{'' if many == 1 else 's'} judged"
     if results.infeasible:
         tried += f", {len(results.infeasible)} that could not be or miss a constraint"
     made = Page(f"Layouts: {results.name}", " ".join(filter(None, [results.question, f"{tried}."])))
@@ -114,11 +115,12 @@ def _best(made: Page, results: Results, shown: Sequence[Trial]) -> None:
     noises = [noise_of(design, _frames(one)) for one, design in held]
     extent = [(design.camera.field_of_view_mm, design.camera.field_height_mm) for _, design in held]
     ball = figures.inclusion_label(trials[0].told["inclusions"][0]).replace("\n", ", ")
+    depth = _levels(shown[0])[0]
     made.figure(
-        figures.layouts(trials, noises, extent),
-        f"The first press on the first inclusion ({ball}; mm and kPa). Right: what one more mm of d and of h "
-        "and 10 kPa of E add to each pixel, in standard deviations of its noise as the protocol averages it; "
-        "the same scale in each column.",
+        figures.layouts(trials, noises, extent, [_press(one, depth) for one in trials]),
+        f"The press nearest to {depth:g} mm on the first inclusion ({ball}; mm and kPa). Right: what "
+        "one more mm of d and of h and 10 kPa of E add to each pixel, in standard deviations of its noise as "
+        "the protocol averages it; the same scale in each column.",
         pixels=True,
     )
     if not any(name in figures.UNITS for name in trials[0].told["inclusions"][0]["sd"]):
@@ -289,6 +291,13 @@ def _frames(trial: Trial) -> int:
 
 def _levels(trial: Trial) -> list[float]:
     return [float(level) for level in trial.told.get("protocol", {}).get("indentation_mm", [2.0])]
+
+
+def _press(trial: Trial, depth: float) -> tuple[int, float]:
+    """Number and depth of the press at the first place that is nearest to a depth."""
+    levels = _levels(trial)
+    number = min(range(len(levels)), key=lambda k: abs(levels[k] - depth))
+    return number, levels[number]
 
 
 def _has_budget(trial: Trial) -> bool:

@@ -42,7 +42,9 @@ OBJECTIVES: dict[str, Objective] = {
         ),
         Objective("bound_depth_mm", "minimize", "bound on the depth, mm, rms over the inclusions", 0, np.inf),
         Objective("bound_modulus_kPa", "minimize", "bound on E, kPa, rms over the inclusions", 0, np.inf),
-        Objective("detection_depth_mm", "maximize", "depth at which the standard lump is found", 0, np.inf),
+        Objective(
+            "detection_depth_mm", "maximize", "depth at which the standard lump is found, mm", 0, np.inf
+        ),
         Objective("snr", "maximize", "tared signal over the noise of a pixel, mean of inclusions", 0, np.inf),
         Objective("uniformity", "maximize", "dim over bright places without inclusion, 0 to 1", 0, 1),
         Objective("contrast", "maximize", "tared signal over the light there, mean of inclusions", 0, np.inf),
