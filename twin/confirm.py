@@ -101,7 +101,8 @@ class Followed:
             whole = each.sum(axis=0)
             solved = np.linalg.pinv(told, 1e-12, hermitian=True)
             own = sum(one.T @ solved @ one for one in each)
-            information = (whole.T @ solved @ whole - own) / (many * (many - 1))
+            value, vector = np.linalg.eigh((whole.T @ solved @ whole - own) / (many * (many - 1)))
+            information = (vector * np.maximum(value, 0.0)) @ vector.T  # noise may make it less than nothing
             row = self.rows[number, at]
             bounds.append(float(np.sqrt(row @ np.linalg.solve(information + prior, row))))
         return _rms(bounds)
@@ -282,18 +283,23 @@ class _Filter:
 def compare(
     followers: Sequence[Follower], minutes: float, tell: Callable[[float], None] = lambda done: None
 ) -> list[Followed]:
-    """Follow light through the layouts in turn until the time is up, at least four times through each."""
-    began, turns = time.monotonic(), 0
+    """Follow light through the layouts until the time is up, at least four times through each; the time is
+    shared out evenly, however many presses a layout takes."""
+    began = time.monotonic()
+    turns, taken = [0] * len(followers), [0.0] * len(followers)
 
     def spent(_: float = 0.0) -> float:
         share = (time.monotonic() - began) / (60.0 * minutes)
         tell(min(share, 1.0))
         return share
 
-    while turns < _LEAST or spent() < 1.0:
-        for one in followers:
-            one.again(spent)
-        turns += 1
+    while min(turns) < _LEAST or spent() < 1.0:
+        few = [number for number, done in enumerate(turns) if done < _LEAST] if spent() >= 1.0 else []
+        number = min(few or range(len(followers)), key=lambda k: taken[k])
+        start = time.monotonic()
+        followers[number].again(spent)
+        turns[number] += 1
+        taken[number] += time.monotonic() - start
     return [one.answers for one in followers]
 
 
