@@ -23,8 +23,11 @@ class Patterns:
     """The patterns of a sensor's LEDs; all that is Lambertian costs nothing."""
 
     def __init__(self, leds: Sequence[Led]) -> None:
-        self.lambertian = all(led.pattern == "lambertian" for led in leds)
+        self.lambertian = all(led.pattern == "lambertian" and led.tilt_deg == 0.0 for led in leds)
         self._exponent = mi.Float([led.exponent if led.pattern == "power" else 1.0 for led in leds])
+        tilts = np.radians([led.tilt_deg for led in leds])
+        self._tilted = bool(tilts.any())
+        self._lean = [mi.Float(part.astype(np.float32)) for part in (np.cos(tilts), np.sin(tilts))]
         self._files = {
             number: mi.MarginalContinuous2D0(_table(ies.read(led.ies)))
             for number, led in enumerate(leds)
@@ -42,6 +45,11 @@ class Patterns:
         cosine = dr.power(dr.maximum(1.0 - inner, 1e-12), dr.rcp(exponent + 1.0))
         spread = dr.sqrt(dr.maximum(1.0 - dr.square(cosine), 0.0)) * dr.rsqrt(dr.maximum(inner, 1e-12))
         direction = mi.Vector3f(spread * disc.x, spread * disc.y, cosine)
+        if self._tilted:
+            along, across = (dr.gather(mi.Float, part, number) for part in self._lean)
+            upright = along * direction.y + across * direction.z
+            axis = dr.abs(along * direction.z - across * direction.y)
+            direction = mi.Vector3f(direction.x, upright, dr.maximum(axis, 1e-6))
         for led, table in self._files.items():
             place, _ = table.sample(sample)
             height = dr.clip(1.0 - dr.square(place.y), 1e-6, 1.0)
@@ -51,15 +59,25 @@ class Patterns:
         return direction
 
     def relative(self, number: mi.UInt32, cosine: mi.Float, tangent: mi.Float, upright: mi.Float) -> mi.Float:
-        """Radiance over that of a Lambertian disc of the same flux, towards directions with these parts.
+        """Radiance over that of a Lambertian disc of the same flux, towards directions with this cosine and
+        parts along tangent and upright, of any length.
 
-        For intensity (m+1) F/(2 pi) cos^m it is (m+1)/2 cos^(m-1).
+        For intensity (m+1) F/(2 pi) cos^m it is (m+1)/2 cos^(m-1); where the axis leans, cos^m of the angles
+        that the direction and its mirror image behind the disc have with it, over the cosine.
         """
         if self.lambertian:
             return mi.Float(1.0)
         exponent = dr.gather(mi.Float, self._exponent, number)
         height = dr.clip(cosine, 1e-4, 1.0)
-        found = 0.5 * (exponent + 1.0) * dr.power(height, exponent - 1.0)
+        if self._tilted:
+            along, across = (dr.gather(mi.Float, part, number) for part in self._lean)
+            long = dr.rsqrt(dr.maximum(dr.square(tangent) + dr.square(upright), 1e-20))
+            rise = across * upright * long * dr.safe_sqrt(1.0 - dr.square(height))
+            ends = (dr.maximum(rise + sign * along * height, 0.0) for sign in (1.0, -1.0))
+            bright = sum((dr.power(end, exponent) for end in ends), mi.Float(0.0)) / height
+        else:
+            bright = dr.power(height, exponent - 1.0)
+        found = 0.5 * (exponent + 1.0) * bright
         if self._files:
             turn = dr.atan2(upright, tangent) * (0.5 * dr.inv_pi)
             place = mi.Point2f(turn - dr.floor(turn), dr.sqrt(dr.maximum(1.0 - height, 1e-8)))

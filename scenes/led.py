@@ -107,6 +107,15 @@ class Led:
         float | None,
         Field(ge=0.5, le=1000.0, description="Exponent m of a power pattern, cos^m; 1 is lambertian."),
     ] = None
+    tilt_deg: Annotated[
+        float,
+        Field(
+            ge=-90.0,
+            le=90.0,
+            description="Angle by which the light's axis is raised from the disc's normal, degrees: to the "
+            "contact, or below towards +y; what would shine behind the disc is mirrored by it. 0 for ies.",
+        ),
+    ] = 0.0
     ies: Annotated[
         str | None,
         Field(
@@ -243,6 +252,8 @@ def _pattern_conflicts(path: str, led: Led) -> Iterator[Conflict]:
             yield Conflict(f"{path}.{name}", value, f"a value where pattern is {pattern!r}")
         elif value is not None and led.pattern != pattern:
             yield Conflict(f"{path}.{name}", value, f"none but where pattern is {pattern!r}")
+    if led.pattern == "ies" and led.tilt_deg != 0.0:
+        yield Conflict(f"{path}.tilt_deg", led.tilt_deg, "0 where pattern is 'ies': turn the file")
     if led.pattern == "ies" and led.ies is not None:
         try:
             ies.read(led.ies)

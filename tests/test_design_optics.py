@@ -32,6 +32,7 @@ BAD = [
     ("leds.1.flux_lm", 3.0, "3.0", "a flux_W, or this with the peak_nm"),
     ("leds.1.exponent", 2.0, "2.0", "none but where pattern is 'power'"),
     ("leds.1.exponent", 0.1, "0.1", "a number >= 0.5 and <= 1000"),
+    ("leds.1.tilt_deg", 100.0, "100.0", "a number >= -90 and <= 90"),
     ("leds.1.side", "above", "'above'", "one of '+x', '-x', '+y', '-y', 'below'"),
 ]
 
@@ -69,6 +70,7 @@ def leds_with(data, **led):
         ({"spectrum": "gaussian", "fwhm_nm": 20.0}, "peak_nm", "a wavelength, nm, for a gaussian spectrum"),
         ({"pattern": "ies"}, "ies", "a value where pattern is 'ies'"),
         ({"pattern": "ies", "ies": "absent.ies"}, "ies", "an IES file that is there"),
+        ({"pattern": "ies", "ies": "absent.ies", "tilt_deg": 9.0}, "tilt_deg", "0 where pattern is 'ies'"),
         ({"ies": "absent.ies"}, "ies", "none but where pattern is 'ies'"),
     ],
 )

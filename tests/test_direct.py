@@ -42,6 +42,10 @@ def fresnel(n1: float, n2: float, cos1: np.ndarray) -> np.ndarray:
 
 def factor(led: Led, cosine: np.ndarray, along: np.ndarray, up: np.ndarray) -> np.ndarray:
     """Intensity over that of a Lambertian disc: of cos^m, and of the file of `test_lamp` in closed form."""
+    if led.tilt_deg:
+        lean, m = np.radians(led.tilt_deg), led.exponent or 1.0
+        ends = (np.maximum(up * np.sin(lean) + sign * cosine * np.cos(lean), 0.0) for sign in (1, -1))
+        return np.asarray((m + 1) / 2 * sum(end**m for end in ends) / cosine)
     if led.pattern == "power":
         assert led.exponent is not None
         return np.asarray((led.exponent + 1) / 2 * cosine ** (led.exponent - 1))
@@ -84,13 +88,15 @@ def thrown(one: Sensor, seed: int = 5) -> np.ndarray:
 
 
 @pytest.mark.parametrize("coupling", ["air", "embedded"])
-@pytest.mark.parametrize("pattern", ["power", "ies"])
+@pytest.mark.parametrize("pattern", ["power", "ies", "leaning"])
 def test_patterns_power_per_block_equals_that_of_thrown_rays(
     variant: str, tmp_path: Path, coupling: str, pattern: str
 ) -> None:
     """cos^4, and a lamp that sends more light to one side; no symmetry helps."""
-    given: dict[str, Any] = {"exponent": 4.0} if pattern == "power" else {"ies": write_skewed(tmp_path)}
-    one = alone(coupling, along_mm=3.0, z_mm=-3.5, pattern=pattern, **given)
+    given: dict[str, Any] = {"pattern": pattern, "ies": write_skewed(tmp_path)}
+    if pattern != "ies":
+        given = {"pattern": "power", "exponent": 4.0, "tilt_deg": 0.0 if pattern == "power" else -20.0}
+    one = alone(coupling, along_mm=3.0, z_mm=-3.5, **given)
     ours, theirs = blocks(irradiance(one), one.guide.width_mm), thrown(one)
     sigma = np.sqrt(theirs * 2.5 * one.leds[0].flux_W / RAYS)  # a ray carries at most 2.5 flux/RAYS
     assert np.abs(ours - theirs).max() < 5e-4 * one.leds[0].flux_W

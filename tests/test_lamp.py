@@ -52,6 +52,8 @@ def leds_of(folder: Path) -> tuple[Led, ...]:
         Led(side="+y", pattern="power", exponent=9.0),
         Led(side="-y", pattern="ies", ies=write_skewed(folder)),
         Led(side="below", pattern="ies", ies=str(folder / "narrow.ies")),
+        Led(side="+x", tilt_deg=30.0),
+        Led(side="+y", pattern="power", exponent=9.0, tilt_deg=-75.0),
     )
 
 
@@ -73,6 +75,11 @@ def test_all_the_flux_goes_out(variant: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(found[2], 5.0 * cosine**8, rtol=1e-4, atol=1e-12)
     exact = skewed(cosine, turn) / cosine * np.pi / SKEWED_FLUX
     np.testing.assert_allclose(found[3][cosine > 0.05], exact[cosine > 0.05], rtol=5e-3)
+    axis = np.array([0.0, 0.5, np.sqrt(0.75)])
+    before = np.stack([sine * np.cos(turn), sine * np.sin(turn), cosine])
+    behind = before * np.array([[1.0], [1.0], [-1.0]])
+    tilted = (np.maximum(axis @ before, 0.0) + np.maximum(axis @ behind, 0.0)) / cosine
+    np.testing.assert_allclose(found[5], tilted, rtol=1e-3, atol=1e-5)
 
 
 def test_rays_are_drawn_as_the_patterns_say(variant: str, tmp_path: Path) -> None:
@@ -99,6 +106,21 @@ def test_rays_are_drawn_as_the_patterns_say(variant: str, tmp_path: Path) -> Non
         chi2 = np.sum((counts - expected)[strong] ** 2 / expected[strong])
         assert chi2 < strong.sum() + 5 * np.sqrt(2 * strong.sum()), leds[number]
         assert counts[~strong].sum() < 1.2 * expected[~strong].sum() + 60
+
+
+@pytest.mark.parametrize(("side", "part"), [("+x", 2), ("-x", 2), ("+y", 2), ("-y", 2), ("below", 1)])
+def test_rays_lean_towards_the_contact(variant: str, side: Any, part: int) -> None:
+    """Mean direction of cos^8 about an axis 40 degrees up: 9/10 along it but for what is mirrored."""
+    import mitsuba as mi
+
+    from scenes import trace
+
+    led = Led(side=side, pattern="power", exponent=8.0, tilt_deg=40.0)
+    sensor = dataclasses.replace(paper_sensor(), leds=(led,))
+    random = np.random.Generator(np.random.Philox(4)).random((4, 100_000)).astype(np.float32)
+    rays = trace.emit(sensor, mi.UInt32(np.zeros(100_000, np.uint32)), [mi.Float(row) for row in random])
+    mean = [float(np.mean(np.asarray(getattr(rays.d, axis)))) for axis in "xyz"]
+    assert mean[part] == pytest.approx(0.9 * np.sin(np.radians(40.0)), abs=5e-3)
 
 
 def test_file_of_a_quadrant_is_unfolded(tmp_path: Path) -> None:

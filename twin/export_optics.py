@@ -128,7 +128,7 @@ def _left_out(design: Design) -> Iterator[str]:
         yield "absorption in guide and glass"
     if guide.walls != "polished" and any(led.coupling == "air" for led in leds):
         yield "paint on the side walls"
-    if any(led.pattern != "lambertian" for led in leds):
+    if any(led.pattern != "lambertian" or led.tilt_deg != 0.0 for led in leds):
         yield "the LEDs' patterns (they are Lambertian)"
     if any(led.spectrum != "line" for led in leds):
         yield f"the LEDs' spectra (all is at {design.light.wavelength_nm:g} nm)"
