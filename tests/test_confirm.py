@@ -15,6 +15,7 @@ from estimation.information import bound, inform
 from twin import coarse as pixels
 from twin import confirm, touches
 from twin.bench import Bench
+from twin.complaint import DesignError
 from twin.confirm import Follower
 from twin.evaluate import Layout, Protocol, noises_of
 
@@ -114,6 +115,11 @@ def test_few_repeats_have_no_spread() -> None:
     one.again()
     with pytest.raises(ValueError, match="repeats: received 1; allowed 4 or more"):
         _ = one.answers
+
+
+def test_something_must_be_asked_for() -> None:
+    with pytest.raises(DesignError, match="unknowns: received none of size_mm"):
+        Follower(LAYOUT, (BALL,), FEW[-1:], Emulator(), bench=BENCH)  # type: ignore[arg-type]
 
 
 @pytest.mark.slow

@@ -24,6 +24,7 @@ import fem
 from estimation.information import pixel_information
 from twin import touches
 from twin.bench import Bench, Work
+from twin.complaint import DesignError
 from twin.evaluate import Evaluation, Judged, Layout, evaluate, judge, noises_of
 from twin.forward import Unknown
 from twin.layers import Lighting, Lit
@@ -38,6 +39,7 @@ PATHS = 2**16
 """Light paths per LED of one picture in one repeat."""
 
 _WALKS = 2  # paths of the light that is walked on moved surfaces, for one of those
+_MOST_BYTES = 2**30  # of gathered light that is kept from repeat to repeat
 _LEAST = 4  # repeats, for a spread
 _WELL_E = 1e7  # no full well: it would cut off one side of the paths' noise
 
@@ -157,6 +159,9 @@ class Follower:
         self._small = self._told.camera
         self._lighting = Lighting(self._small)
         self._names = tuple(name for name in BOUNDS.values() if name in self._told.judged[0].names)
+        if not self._names:
+            wanted = ", ".join(BOUNDS.values())
+            raise DesignError("unknowns", f"none of {wanted}", "at least one of them")
         self._filters = [self._filter(one) for one in self._told.judged]
         unknowns, seconds = self._told.unknowns, {"mechanics": 0.0, "light": 0.0}
         self._work = work = Work(
@@ -224,15 +229,17 @@ class Follower:
         from scenes.tangent import gathered
 
         spectral, (shape, beside) = self._lighting.spectral, self._shapes[press]
-        if press not in self._straight:
-            self._straight[press] = [gathered(renderer, shape) for renderer in spectral.renderers]
+        straight = self._straight.get(press)
+        if straight is None:
+            straight = [gathered(renderer, shape) for renderer in spectral.renderers]
+            size = sum(one.light.nbytes + one.slopes.nbytes for one in straight)
+            if (len(self._straight) + 1) * size < _MOST_BYTES:
+                self._straight[press] = straight
         each = []
-        for renderer, band, straight in zip(
-            spectral.renderers, spectral.bands, self._straight[press], strict=True
-        ):
+        for renderer, band, here in zip(spectral.renderers, spectral.bands, straight, strict=True):
             many = max(self.paths // band.parts, 2)
             picture, answers = scored(renderer, shape, beside, many, seed)
-            answers += moved(renderer, shape, straight, beside, _WALKS * many, seed)
+            answers += moved(renderer, shape, here, beside, _WALKS * many, seed)
             each.append((picture, answers))
         picture = spectral.together([one for one, _ in each])
         slopes = [spectral.together([of[k] for _, of in each]) for k in range(len(self._moving))]
