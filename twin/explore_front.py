@@ -23,7 +23,7 @@ _STYLE = f"""\
 .front {{ display: flex; gap: 1.2rem; align-items: flex-start; flex-wrap: wrap; }}
 .front svg {{ width: {_WIDTH}px; max-width: 100%; height: auto; }}
 .front .side {{ flex: 1 1 320px; min-width: 300px; font-size: .88rem; }}
-#front select {{ font: inherit; font-size: .88rem; width: 18.5rem; }}
+#front select {{ font: inherit; font-size: .88rem; width: 21rem; }}
 #front label {{ font-size: .88rem; margin-right: .8rem; color: #555; }}
 .front circle {{ cursor: pointer; }}
 .front circle:focus-visible {{ outline: 2px solid {INK}; outline-offset: 2px; }}
@@ -106,7 +106,8 @@ _SCRIPT = """\
       if (trial.rank < 2 && trial.id !== chosen) return;
       var left = px(a) > box.left + box.wide - 80, at = py(b) + 4;
       function meets(t) { return Math.abs(t[1] - at) < 13 && Math.abs(t[0] - px(a)) < 75; }
-      while (taken.some(meets)) at -= 13;
+      for (var turn = 1; turn < 40 && (at < box.top + 9 || taken.some(meets)); turn += 1)
+        at = py(b) + 4 + (turn % 2 ? -13 : 13) * Math.ceil(turn / 2);
       taken.push([px(a), at]);
       put(svg, 'text', {x: px(a) + (left ? -11 : 11), y: at, 'text-anchor': left ? 'end' : 'start'},
         trial.name);
