@@ -23,7 +23,7 @@ _STYLE = f"""\
 .front {{ display: flex; gap: 1.2rem; align-items: flex-start; flex-wrap: wrap; }}
 .front svg {{ width: {_WIDTH}px; max-width: 100%; height: auto; }}
 .front .side {{ flex: 1 1 320px; min-width: 300px; font-size: .88rem; }}
-#front select {{ font: inherit; font-size: .88rem; width: 21rem; }}
+#front select {{ font: inherit; font-size: .88rem; width: 23rem; }}
 #front label {{ font-size: .88rem; margin-right: .8rem; color: #555; }}
 .front circle {{ cursor: pointer; }}
 .front circle:focus-visible {{ outline: 2px solid {INK}; outline-offset: 2px; }}

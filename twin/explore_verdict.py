@@ -65,7 +65,7 @@ def _lost(results: Results, trial: Trial) -> str:
         now, before = trial.objectives.get(name, np.nan), results.baseline.objectives.get(name, np.nan)
         worse = now - before if way == "minimize" else before - now
         if worse > _CLEARLY * abs(before):
-            found.append(f" {OBJECTIVES[name].text} is {digits(now)} (baseline {digits(before)})")
+            found.append(f" {OBJECTIVES[name].text}: {digits(now)} (baseline {digits(before)})")
     return ",".join(found)
 
 
