@@ -109,7 +109,7 @@ def _confirm(found: Exploration, minutes: float) -> None:
         return
     study, design = found.study, found.design
     layouts = [layout_fields.base(study, design), layout_fields.layout(study, design, best["values"])]
-    names = ["the base", f"layout {best['number']}"]
+    names = ["the baseline", f"trial {best['number']}"]
     emulator = None if found.emulator is None else presses.emulator_of(design, found.emulator)
     with Reporter() as tell:
         tell("judging both again", 0.0)
