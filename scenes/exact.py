@@ -93,6 +93,7 @@ class _View:
     width: float
     many: int
     layers: mi.Int64
+    spread_per_mm: float
 
     @staticmethod
     def of(film: Film, sensor: Sensor, many: int = 1) -> _View:
@@ -101,7 +102,9 @@ class _View:
         stacked = np.concatenate([film.film, film.lean], axis=-1).astype(np.float32)
         maps = mi.Texture2f(mi.TensorXf(stacked), wrap_mode=dr.WrapMode.Clamp)
         layers = dr.zeros(mi.Int64, len(sensor.leds) * rows * columns * many)
-        return _View(maps, rows, columns, sensor.guide.width_mm, many, layers)
+        width, middle = sensor.guide.width_mm, _MAP // 2
+        spread = (film.lean[middle, middle + 1, 0] - film.lean[middle, middle - 1, 0]) * (_MAP - 1) / width / 2
+        return _View(maps, rows, columns, width, many, layers, float(spread))
 
     def _look_up(self, x: mi.Float, y: mi.Float) -> list[mi.Float]:
         # nodes sit at the ends of the face, a texture's in the middle of its texels

@@ -33,9 +33,9 @@ class Sight:
     ----------
     position_mm : (rows, columns, 2)
         Point of the deformed surface that each pixel sees directly.
-    points : list of (x, y, gains)
-        For each sight, on the device: position in units of the guide's width (0..1), and radiance at the
-        camera per light that goes up in the tissue in each mode, 1/sr.
+    points : list of (x, y, gain)
+        For each sight, on the device: where light comes from that is seen there, in units of the guide's
+        width (0..1 is the guide), and radiance at the camera per light that goes up in the tissue, 1/sr.
     windows : (sights, rows, columns)
         Radiance at the camera over that in the guide, for each sight.
     lamps : (n_led, rows, columns)
@@ -43,7 +43,7 @@ class Sight:
     """
 
     position_mm: NDArray[np.float32]
-    points: list[tuple[mi.Float, mi.Float, list[mi.Float]]]
+    points: list[tuple[mi.Float, mi.Float, mi.Float]]
     windows: NDArray[np.float32]
     lamps: NDArray[np.float32]
 
@@ -62,7 +62,9 @@ def look(scene: mi.Scene, sensor: Sensor, table: Table, coupling: Coupling, rays
     # the run in the glass and back, near the axis, as one in the guide
     in_glass = 2.0 * sensor.glass.thickness_mm * guide.refractive_index / sensor.glass.refractive_index
     lamps, patterns = [mi.Float(0.0) for _ in sensor.leds], Patterns(sensor.leds)
-    points, windows = [], []
+    points, windows, position = [], [], ()
+    # light that leaves aslant has come from below, a run behind; by Snell's law of this sine in the tissue
+    behind = float(coupling.aslant.run_mm * np.sqrt(coupling.scale))
     start = mi.Point3f(*origin) + _STEP_MM / direction.z * direction
     for _ in range(_SIGHTS):
         si = meet(scene, named["contact"], start, direction)
@@ -73,8 +75,15 @@ def look(scene: mi.Scene, sensor: Sensor, table: Table, coupling: Coupling, rays
         fraction = dr.select(seen, contact.eval_attribute_1("vertex_contact_fraction", si, seen), 0.0)
         transmitted = table.transmittance(fraction, cosine, seen)
         emitted = dr.select(seen, gain * transmitted * (coupling.scale * dr.inv_pi), 0.0)
-        gains = [emitted * lobe for lobe in table.lobes(cosine, seen)]
-        points.append((si.p.x / guide.width_mm + 0.5, si.p.y / guide.width_mm + 0.5, gains))
+        emitted *= table.lobes(cosine, seen)[0] / float(coupling.lobes[0, -1])
+        points.append(
+            (
+                (si.p.x + behind * direction.x) / guide.width_mm + 0.5,
+                (si.p.y + behind * direction.y) / guide.width_mm + 0.5,
+                emitted,
+            )
+        )
+        position = position or (si.p.x, si.p.y)
         # mirrored in the contact surface, down, mirrored in the lower faces, up again; the slope left out
         gain = dr.select(seen, gain * (1.0 - transmitted), 0.0)
         down = mi.Vector3f(direction.x, direction.y, -direction.z)
@@ -88,12 +97,11 @@ def look(scene: mi.Scene, sensor: Sensor, table: Table, coupling: Coupling, rays
             run * direction.x, run * direction.y, 0.0
         )
         start += _STEP_MM / direction.z * direction
-    dr.eval(points, windows, lamps)
-    x, y = (np.asarray(points[0][i]).reshape(shape) for i in (0, 1))
-    position = (np.stack([x, y], axis=-1) - 0.5) * guide.width_mm
-    layers = np.stack([np.broadcast_to(np.asarray(layer), x.size).reshape(shape) for layer in lamps])
+    dr.eval(points, windows, lamps, position)
+    seen_at = np.stack([np.asarray(at).reshape(shape) for at in position], axis=-1)
+    layers = np.stack([np.broadcast_to(np.asarray(layer), rays.transmittance.size).reshape(shape) for layer in lamps])
     through = np.stack([np.asarray(window).reshape(shape) for window in windows])
-    return Sight(position.astype(np.float32), points, through, layers)
+    return Sight(seen_at.astype(np.float32), points, through, layers)
 
 
 def meet(
@@ -178,19 +186,19 @@ def _fresnel(n_in: float, n_out: float, square: mi.Float) -> mi.Float:
     return dr.select(square < n_out**2, 0.5 * (dr.square(s) + dr.square(p)), 1.0)
 
 
-def picture(sight: Sight, upward: NDArray[np.float64]) -> NDArray[np.float32]:
+def picture(sight: Sight, seen: NDArray[np.float64], margin: int) -> NDArray[np.float32]:
     """Radiance in air at the pixels, (n_led, rows, columns), in W m⁻² sr⁻¹.
 
-    `upward` (n_led, modes, m, m), W/mm², is the light that goes up in the tissue, on cells [iy, ix] of the
-    guide's face.
+    `seen` (n_led, m, m), W/mm², is the light that goes up in the tissue towards the camera, on cells [iy, ix]
+    of the guide's face with `margin` cells beside it.
     """
-    n_led, modes = upward.shape[:2]
+    n_led, cells = len(seen), seen.shape[-1]
     total = [mi.Float(0.0) for _ in range(n_led)]
-    for x, y, gains in sight.points:
-        layers = look_up(upward.reshape(n_led * modes, *upward.shape[2:]), x, y)
-        for led in range(n_led):
-            total[led] += sum(gain * layers[led * modes + i] for i, gain in enumerate(gains))
+    for x, y, gain in sight.points:
+        x, y = (at * (1.0 - 2.0 * margin / cells) + margin / cells for at in (x, y))
+        for led, layer in enumerate(look_up(seen, x, y)):
+            total[led] += gain * layer
     dr.eval(total)
     shape = (n_led, *sight.position_mm.shape[:2])
-    seen = np.stack([np.asarray(layer) for layer in total]).reshape(shape)
-    return np.asarray((seen + sight.lamps) * np.float32(1e6))
+    found = np.stack([np.asarray(layer) for layer in total]).reshape(shape)
+    return np.asarray((found + sight.lamps) * np.float32(1e6))

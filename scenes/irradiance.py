@@ -11,10 +11,10 @@ from functools import lru_cache
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-import scipy.fft
 from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
 
+from .aslant import HARMONICS, STEEP
 from .contact import ContactOptics
 from .tissue import Coupling
 
@@ -25,43 +25,38 @@ _RIM_CELLS = 2  # 0.5 mm
 
 
 @dataclass(frozen=True)
-class Carried:
-    """Separable form of one moment of `tissue.carried` times T: sum_k rows[:, k](A_r) columns[k](cos)."""
+class Turning:
+    """Separable form of what turns with the azimuth, h_r(cos) T(A_r, cos) = sum_k rows[r, :, k] columns[k](cos),
+    each with a part of the cosine and one of the sine of the azimuth times the harmonic."""
 
-    harmonic: int  # of the azimuth: 0, or 1 or 2 with a part of the cosine and one of the sine
-    rows: Array  # (n_fraction, count), mm or mm²
+    harmonic: int
+    rows: Array  # (functions, n_fraction, count)
     columns: Array  # (count, n_cos)
-
-    @property
-    def layers(self) -> int:
-        return len(self.columns) * (2 if self.harmonic else 1)
 
 
 @dataclass(frozen=True)
 class AngularBasis:
-    """Separable form of what enters the tissue: phi_i(cos) T(A_r, cos) = sum_k rows[i, :, k] columns[k](cos).
+    """Separable form of what enters the tissue: h_r(cos) T(A_r, cos) = sum_k rows[r, :, k] columns[k](cos).
 
-    Light arrives spread over angles, so T and the tissue's lobes phi_i cannot be taken out of the integral
-    over them; with this form the integral is `count` irradiances, smooth over the surface, whatever the
-    pressure does. The same holds for what enters aslant and comes out beside where it went in.
+    Light arrives spread over angles, so T and the functions h_r of the angle of entry (`aslant`; the tissue's
+    lobes phi_i are the first) cannot be taken out of the integral over them; with this form the integral is
+    `layers` irradiances, smooth over the surface, whatever the pressure does.
     """
 
-    rows: Array  # (modes, n_fraction, count)
+    rows: Array  # (functions, n_fraction, count)
     columns: Array  # (count, n_cos)
-    carried: tuple[Carried, ...] = ()
-    reach_mm: float = 0.0  # of the run before light comes out, root of half its mean square
-    spread_mm: float = 0.0  # `tissue.Coupling.spread_mm`
+    turning: tuple[Turning, ...] = ()
 
     @property
     def layers(self) -> int:
         """Maps that light is counted on."""
-        return len(self.columns) + sum(moment.layers for moment in self.carried)
+        return len(self.columns) + sum(2 * len(one.columns) for one in self.turning)
 
     def weights(self) -> Weights:
         """The columns on the device."""
         return Weights(
             _Columns.of(self.columns),
-            tuple((moment.harmonic, _Columns.of(moment.columns)) for moment in self.carried),
+            tuple((one.harmonic, _Columns.of(one.columns)) for one in self.turning),
         )
 
 
@@ -92,41 +87,48 @@ class Weights:
     """How much arriving light counts on each map of an `AngularBasis`."""
 
     plain: _Columns
-    carried: tuple[tuple[int, _Columns], ...]
+    turning: tuple[tuple[int, _Columns], ...]
 
     def at(self, cosine: mi.Float, x: mi.Float, y: mi.Float, active: mi.Bool) -> list[mi.Float]:
         """Weights on the maps of light at a cosine of incidence, whose direction has the parts x and y along
         the surface, of any length."""
         unit = dr.rsqrt(dr.maximum(dr.square(x) + dr.square(y), 1e-20))
         x, y = x * unit, y * unit
-        azimuth = {0: (mi.Float(1.0),), 1: (x, y), 2: (x * x - y * y, 2.0 * x * y)}
+        azimuth = [(mi.Float(1.0), mi.Float(0.0)), (x, y)]
+        while len(azimuth) <= HARMONICS:
+            cos, sin = azimuth[-1]
+            azimuth.append((cos * x - sin * y, sin * x + cos * y))
         found = self.plain.at(cosine, active)
-        for harmonic, columns in self.carried:
+        for harmonic, columns in self.turning:
             here = columns.at(cosine, active)
             found += [part * weight for part in azimuth[harmonic] for weight in here]
         return found
 
 
 def angular_basis(
-    optics: ContactOptics, coupling: Coupling, tolerance: float = 5e-5, carried: float = 1e-2
+    optics: ContactOptics, coupling: Coupling, tolerance: float = 5e-5, turning: float = 5e-3
 ) -> AngularBasis:
-    """Truncated singular value decompositions, largest errors at most `tolerance`, and of the moments
-    `carried` times their largest value."""
-    lobes, through = coupling.lobes, optics.transmittance
-    rows, columns = _separated((lobes[:, None] * through).reshape(-1, lobes.shape[1]), tolerance)
-    moments = [
-        Carried(harmonic, *_separated(moment * through, carried * max(float(np.abs(moment).max()), 1e-12)))
-        for harmonic, moment in zip((1, 2, 0), coupling.carried, strict=True)
-    ]
-    reach = float(np.sqrt(2.0 * coupling.carried[1].max()))
-    return AngularBasis(
-        rows.reshape(len(lobes), -1, len(columns)), columns, tuple(moments), reach, coupling.spread_mm
-    )
+    """Truncated singular value decompositions; largest errors at most `tolerance` for the lobes, and
+    `turning` of the largest answer of the tissue for all other parts."""
+    modes, apart = len(coupling.lobes), coupling.aslant
+    largest = max(float(np.abs(apart.lambertian).max()), 1e-12)
+    found = []
+    for m, (ways, spread) in enumerate(zip(coupling.ways, apart.transforms, strict=True)):
+        if len(ways):
+            counts = np.abs(spread[STEEP]).max(axis=-1) / largest / turning
+            if m == 0:
+                counts[:modes] = 1.0 / tolerance
+            products = (counts[:, None] * ways)[:, None] * optics.transmittance
+            rows, columns = _separated(products.reshape(-1, ways.shape[1]), 1.0)
+            rows = rows.reshape(len(ways), -1, len(columns)) / counts[:, None, None]
+            found.append(Turning(m, rows, columns))
+    return AngularBasis(found[0].rows, found[0].columns, tuple(found[1:]))
 
 
 def _separated(products: Array, tolerance: float) -> tuple[Array, Array]:
+    """Rows and columns whose product is within a tolerance."""
     u, s, v = np.linalg.svd(products, full_matrices=False)
-    for count in range(1, s.size + 1):
+    for count in range(s.size + 1):
         rows, columns = u[:, :count] * s[:count], v[:count]
         if np.abs(rows @ columns - products).max() <= tolerance:
             break
@@ -141,81 +143,33 @@ def look_up(maps: Array, x: mi.Float, y: mi.Float) -> list[mi.Float]:
 
 @dataclass(frozen=True)
 class Entrance:
-    """An `AngularBasis` where the real contact fraction is (m, m), on cells over a face of `width_mm`."""
+    """An `AngularBasis` where the real contact fraction is (m, m), on cells over the guide's face."""
 
     basis: AngularBasis
-    rows: Array  # (m, m, modes, count)
-    carried: tuple[Array, ...]  # (m, m, count) each
-    width_mm: float
+    rows: Array  # (m, m, functions, count)
+    turning: tuple[Array, ...]  # (m, m, functions, count) each
 
     @staticmethod
-    def at(basis: AngularBasis, fraction: Array, width_mm: float) -> Entrance:
-        carried = tuple(by_fraction(moment.rows, fraction) for moment in basis.carried)
-        return Entrance(basis, by_fraction(np.moveaxis(basis.rows, 0, 1), fraction), carried, width_mm)
+    def at(basis: AngularBasis, fraction: Array) -> Entrance:
+        every = (basis, *basis.turning)
+        rows = [by_fraction(np.moveaxis(one.rows, 0, 1), fraction) for one in every]
+        return Entrance(basis, rows[0], tuple(rows[1:]))
 
 
-def transmitted(entrance: Entrance, irradiance: Array, margin: int) -> Array:
-    """Irradiance that enters the tissue in each mode, (n, modes, m + 2 margin, m + 2 margin) W/mm².
+def transmitted(entrance: Entrance, irradiance: Array) -> Array:
+    """Irradiance that enters the tissue, weighed with each function of the angle of entry, W/mm².
 
-    From maps (n, layers, m, m) on cells over the face.
-    Mode 0 is carried on to where the light comes out, as `tissue.carried` tells: less div(M - div Q). What
-    goes over the rim is found in the margin beside it. A kernel of another width s' differs from that of
-    width s by (1 + k²s²)/(1 + k²s'²), about 1 - k²(s'² - s²)/(1 + k²s²): so the part of Q that is alike in
-    all directions is smoothed before its derivatives are taken.
+    From maps (n, layers, m, m) on cells over the face; (n, functions, m, m): those of harmonic 0, and of each
+    harmonic after it its functions with the cosine of the azimuth, and again with the sine.
     """
-    basis, shape = entrance.basis, irradiance.shape[-2:]
-    first, step = len(basis.columns), entrance.width_mm / shape[0]
-    entering = np.einsum("yxik,nkyx->niyx", entrance.rows, irradiance[:, :first], optimize=True)
-    flow = np.zeros((2, len(irradiance), *shape))
-    for moment, rows in zip(basis.carried, entrance.carried, strict=True):
-        parts = 2 if moment.harmonic else 1
-        maps = irradiance[:, first : first + moment.layers]
-        maps = maps.reshape(len(maps), parts, -1, *shape)
-        first += moment.layers
-        found = np.einsum("yxk,nckyx->cnyx", rows, maps, optimize=True)
-        if moment.harmonic == 1:
-            flow += found
-        else:
-            if moment.harmonic == 0:
-                found = _smoothed(found, basis.spread_mm / step)
-            by_y, by_x = np.gradient(found, step, axis=(2, 3))
-            if moment.harmonic == 2:
-                flow -= np.stack([by_x[0] + by_y[1], by_x[1] - by_y[0]])
-            else:
-                flow -= np.stack([by_x[0], by_y[0]])
-    wide = np.pad(entering, ((0, 0), (0, 0), (margin, margin), (margin, margin)))
-    if basis.carried:
-        fade = np.exp(-(np.arange(margin) + 0.5) * step / basis.reach_mm)
-        wide[:, 0] -= _divergence(flow, step, fade / fade.sum())
-    return wide
-
-
-def _smoothed(fields: Array, reach: float) -> Array:
-    """1/(1 + k² reach²) of fields (..., m, m), reach in cells, mirrored at the rim."""
-    wave2 = (np.pi * np.arange(fields.shape[-1]) / fields.shape[-1]) ** 2
-    spectrum = scipy.fft.dctn(fields, axes=(-2, -1), workers=1)
-    spectrum /= 1.0 + reach**2 * (wave2[:, None] + wave2)
-    return np.asarray(scipy.fft.idctn(spectrum, axes=(-2, -1), workers=1))
-
-
-def _divergence(flow: Array, step: float, fade: Array) -> Array:
-    """Of flows (2, n, m, m), x first, on cells of that step, with a margin (2, n, m + 2 margin, ...).
-
-    Over the rim they go out, none come in; so many cells beside it share in what goes out as `fade` tells.
-    """
-    margin, cells = len(fade), flow.shape[-1]
-    total = np.zeros((flow.shape[1], cells + 2 * margin, cells + 2 * margin))
-    inside = slice(margin, margin + cells)
-    for part, axis in ((flow[0], 2), (flow[1], 1)):
-        along = np.moveaxis(part, axis, -1)
-        faces = np.empty((*along.shape[:-1], cells + 1))
-        faces[..., 1:-1] = 0.5 * (along[..., 1:] + along[..., :-1])
-        faces[..., 0], faces[..., -1] = np.minimum(along[..., 0], 0.0), np.maximum(along[..., -1], 0.0)
-        target = np.moveaxis(total, axis, -1)[:, inside]
-        target[..., inside] += np.diff(faces, axis=-1) / step
-        target[..., :margin] += faces[..., :1] * fade[::-1] / step
-        target[..., margin + cells :] -= faces[..., -1:] * fade / step
-    return total
+    first = len(entrance.basis.columns)
+    found = [np.einsum("yxik,nkyx->niyx", entrance.rows, irradiance[:, :first], optimize=True)]
+    for part, rows in zip(entrance.basis.turning, entrance.turning, strict=True):
+        for _ in ("cosine", "sine"):
+            maps = irradiance[:, first : first + len(part.columns)]
+            first += len(part.columns)
+            found.append(np.einsum("yxik,nkyx->niyx", rows, maps, optimize=True))
+    return np.concatenate(found, axis=1)
 
 
 def by_fraction(rows: Array, fraction: Array) -> Array:

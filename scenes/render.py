@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from . import backend, spread, surface, tissue, view
+from . import backend, passage, spread, surface, tissue, view
 from .sensor import NotModelled, Sensor
 
 if TYPE_CHECKING:
@@ -97,11 +97,12 @@ class Renderer:
             optics = build.optics_of(sensor)
             coupling = build.coupling_of(sensor, optics)
             _, body = tissue.body_behind(sensor.skin, sensor.tissue)
-            cells = transport.GRID + 2 * transport.MARGIN
-            width = sensor.guide.width_mm * cells / transport.GRID
-            spreads = spread.spreader(body, coupling, width, cells)
+            cells, margin, width = transport.GRID, transport.MARGIN, sensor.guide.width_mm
+            first = passage.passage(body, coupling, width, cells, margin)
+            wide = cells + 2 * margin
+            spreads = spread.spreader(body, coupling, width * wide / cells, wide)
             self.basis = angular_basis(optics, coupling)
-        self.behind = transport.Behind(coupling, spreads)
+        self.behind = transport.Behind(coupling, first, spreads)
         self.packed = Table.pack(optics, coupling)
         self.table = Table(self.packed)
         self.scene = build.load_scene(sensor, self.packed)
@@ -206,7 +207,7 @@ class Renderer:
             with threadpool_limits(1):
                 light = transport.transport(*parts, seed * _MOST_PASSES + number)
             lights.append(light)
-            yield gather.picture(sight, light.upward)
+            yield gather.picture(sight, light.seen, transport.MARGIN)
 
     def _again(
         self, shape: surface.OpticalSurface, sight: Sight, traced: Array | TracedLight, walked: list[Array]
@@ -220,9 +221,9 @@ class Renderer:
             light = (
                 traced if isinstance(traced, np.ndarray) else traced.at(self.sensor, shape, ground.fraction)
             )
-            upward = transport.again(self.sensor, self.basis, self.behind, ground, straight, light)
+            seen = transport.again(self.sensor, self.basis, self.behind, ground, straight, light)
         walked.append(light)
-        yield gather.picture(sight, upward)
+        yield gather.picture(sight, seen, transport.MARGIN)
 
     def _followed(self, sight: Sight, samples: int, seed: int) -> Iterator[NDArray[np.floating]]:
         """Pictures (n_led, rows, columns) of independent passes."""

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,21 +87,76 @@ class Slab:
         mu, weight = cosines()
         return np.asarray(self.factors(cosine) @ (2.0 * mu * weight))
 
-    def spread(self) -> Array:
-        """Plane albedo times the mean square of the way, in mean free paths, along the face from the first
-        collision to where light comes out, for light in at the N Gauss cosines; (N,)."""
+    def aslant(self, k: Array, cosine: Array, azimuth: Array) -> NDArray[np.complex128]:
+        """Fourier transform of where a beam comes out, (2, n_k, n_cos, n_azimuth).
+
+        Of unit irradiance that enters at cosines (n_cos,) > 0 and azimuths (n_azimuth,), rad, to the wave
+        vector of length k (n_k,): (0) of all light that leaves; its total is the plane albedo. (1) Of the
+        radiance factor π L / E along the normal. The place r counts as exp(-i k·r).
+
+        The beam falls with depth as exp(-p z), p = 1/µ + i k tanθ cosφ. Where it collides, light is like that
+        of an isotropic source; what such a source at z sends out is by reciprocity the field G(z) of light
+        that enters as the exit looks: Lambertian, or along the normal. One solve for each k so serves all
+        ways in.
+        """
+        inward = np.asarray(cosine, dtype=np.float64)[:, None]
+        ahead = np.sqrt(1.0 - inward**2) / inward * np.cos(azimuth)
+        found = np.empty((2, len(k), len(inward), len(azimuth)), dtype=np.complex128)
+        for number, wave in enumerate(np.asarray(k, dtype=np.float64)[:, None]):
+            p = 1.0 / inward + 1j * wave * ahead
+            rates, falling, rising = diffuse = self._diffuse_field(wave)
+            for part, field in enumerate((diffuse, self._steep_field(wave))):
+                found[part, number] = self.albedo / inward * self._overlap(p, *field)
+            if self.backing > 0.0:
+                up, down = self._passes(wave)
+                mirrored = rates, rising, falling
+                arrives = np.exp(-p * self.depth) + self.albedo / inward * self._overlap(p, *mirrored)
+                steep = np.exp(-self.depth) + self.albedo * self._overlap(np.ones((1, 1)), *mirrored)
+                again = self.backing / (1.0 - self.backing * up) * arrives
+                found[:, number] += again * np.stack([down[:, None], steep])
+        return found
+
+    def _diffuse_field(self, k: Array) -> tuple[Array, Array, Array]:
+        """G(z) of all light that leaves, at one wave number (1,): rates λ of modes, and amplitudes of
+        exp(-λ z) and exp(-λ (d - z)), (N,) each."""
         mu, weight = cosines()
-        k2 = (1e-3 * decay_rate(self.albedo)) ** 2
-        k = np.sqrt(np.array([0.0, k2]))
-        q, rate, _ = self._rates(k)
-        falling, rising = self._amplitudes(k, (mu * q)[:, :, None] * np.diag(2.0 / weight))
-        forth, back = self._leaving(q, rate)
-        fade = np.exp(-rate * self.depth) if np.isfinite(self.depth) else np.zeros((2, mu.size))
-        out = np.einsum("kn,knc->kc", back, falling) + np.einsum("kn,knc->kc", fade * forth, rising)
-        # a source exp(-q z) with q(k) in place of exp(-z/µ): its own change is taken out
-        plane = out[0]
-        slope = np.gradient(plane, mu)
-        return np.asarray(-4.0 * ((out[1] - out[0]) / k2 + 0.5 * mu**2 * (plane + mu * slope)))
+        q, rate, vectors = self._rates(k)
+        falling, rising = self._amplitudes(k, (0.5 * mu**2 * q)[..., None])
+        unit = (np.sqrt(weight) / mu) @ vectors
+        return rate[0], unit * falling[0, :, 0], unit * rising[0, :, 0]
+
+    def _steep_field(self, k: Array) -> tuple[Array, Array, Array]:
+        """The same of the radiance factor along the normal: C exp(-z), and modes that undo it at the faces."""
+        mu, weight = cosines()
+        q, rate, vectors = self._rates(k)
+        normal = 1.0 + 1e-7  # off the pole where a mode falls as fast
+        own = 0.25 / (1.0 - self.albedo * np.sum(weight / (mu**2 * (q**2 - normal**2)), axis=1))
+        shape = (-0.5 * self.albedo * own[:, None])[..., None]
+        falling, rising = self._amplitudes(k, shape / (q - normal)[..., None])
+        if np.isfinite(self.depth):
+            gone = np.exp(-normal * self.depth)
+            up, down = self._amplitudes(k, shape * gone / (q + normal)[..., None])
+            falling, rising = falling + down, rising + up
+        unit = (np.sqrt(weight) / mu) @ vectors
+        return (
+            np.append(rate[0], normal),
+            np.append(unit * falling[0, :, 0], own),
+            np.append(unit * rising[0, :, 0], 0.0),
+        )
+
+    def _overlap(self, p: NDArray[np.inexact], rate: Array, falling: Array, rising: Array) -> Any:
+        """∫ exp(-p z) G(z) dz over the depth, shape of p (Re p >= 1)."""
+        p = p[..., None]
+        if np.isinf(self.depth):
+            return (falling / (rate + p)).sum(axis=-1)
+        near = falling * -np.expm1(-(rate + p) * self.depth) / (rate + p)
+        # ∫ exp(-p z) exp(-λ (d - z)) dz, safe where λ = p
+        apart = p - rate
+        later = np.exp(-np.where(apart.real > 0.0, rate, p) * self.depth)
+        apart = np.where(apart.real > 0.0, apart, -apart) * self.depth
+        small = np.abs(apart) < 1e-8
+        ratio = np.where(small, 1.0, -np.expm1(-apart) / np.where(small, 1.0, apart))
+        return (near + rising * self.depth * later * ratio).sum(axis=-1)
 
     def _amplitudes(self, k: Array, entering: Array) -> tuple[Array, Array]:
         """Amplitudes (n, N, c) of the modes that fall with depth and of those that rise, for c ways (N, c) or

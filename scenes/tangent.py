@@ -91,5 +91,5 @@ def picture(renderer: Renderer, shape: OpticalSurface, straight: Straight, trace
     ground = transport.survey(renderer.scene, sensor)
     light = straight.on(direct.relief(sensor, shape))
     with threadpool_limits(1):
-        upward = transport.again(sensor, basis, behind, ground, light, traced)
-    return np.asarray(gather.picture(sight, upward), np.float64)
+        seen = transport.again(sensor, basis, behind, ground, light, traced)
+    return np.asarray(gather.picture(sight, seen, transport.MARGIN), np.float64)

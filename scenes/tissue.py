@@ -21,6 +21,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from .aslant import Aslant, aslant
 from .contact import ContactOptics, moment_weights
 from .ftir import gap_transmittance
 from .radial import Kernel, kernel
@@ -64,14 +65,6 @@ class TissueOptics:
         """Total diffuse reflectance for Lambertian light, without boundary."""
         return float(self.strengths[0])
 
-    @property
-    def spread_mm(self) -> float:
-        """Half the root of the mean square distance, mm, at which Lambertian light comes out: the transform
-        falls as 1 - (spread k)² at small k."""
-        small = 1e-3 * decay_rate(self.slab.albedo)
-        none, some = self.slab.reflectance(np.array([0.0, small]))
-        return float(np.sqrt(max(none - some, 0.0) / max(none, _LEAST))) / small / self.transport_per_mm
-
     def lobe(self, cosine: Array) -> Array:
         """φ_i at cosines in the tissue: (modes, *shape of cosine)."""
         grid = np.linspace(0.0, 1.0, self.lobes.shape[1])
@@ -110,10 +103,10 @@ class Coupling:
         (n1/n3)²: radiance in the guide over that in the tissue.
     free : (modes, modes)
         W of bare skin beside the guide, in air.
-    carried : (3, n_cos)
-        φ_0 times the moments of where light comes out, by harmonics of the azimuth; see `carried`.
-    spread_mm
-        Half the root of the mean square distance, mm, at which Lambertian light comes out.
+    aslant
+        How light that enters aslant comes out.
+    ways : by harmonic m of the azimuth, (r_m, n_cos)
+        `Aslant.functions` on the cosines in the guide.
     """
 
     lobes: Array
@@ -121,8 +114,8 @@ class Coupling:
     gain: Array
     scale: float
     free: Array
-    carried: Array
-    spread_mm: float
+    aslant: Aslant
+    ways: tuple[Array, ...]
 
 
 def tissue_optics(
@@ -194,44 +187,14 @@ def couple(optics: ContactOptics, tissue: TissueOptics, n_guide: float, n_tissue
     passed = np.einsum("m,im,jm,am->aij", moments, lobes, lobes, optics.transmittance, optimize=True)
     held = overlap - scale * passed
     free = overlap - _passed_by_bare_skin(tissue, n_tissue)
-    there = np.sqrt(np.maximum(inside, 0.0))
-    grid = np.linspace(0.0, 1.0, _COSINES)
-    moments = np.stack([np.interp(there, grid, moment) for moment in carried(tissue)]) * (inside > 0.0)
+    apart = aslant(tissue.slab, tissue.transport_per_mm, tissue.lobes)
+    there, grid = np.sqrt(np.maximum(inside, 0.0)), np.linspace(0.0, 1.0, _COSINES)
+    ways = tuple(
+        np.array([np.interp(there, grid, one) for one in several]).reshape(-1, cosine.size) * (inside > 0.0)
+        for several in apart.functions
+    )
     gain = scale * _resummed(tissue.strengths, held)
-    return Coupling(lobes, held, gain, scale, free, moments, tissue.spread_mm)
-
-
-def carried(tissue: TissueOptics) -> Array:
-    """How light that enters aslant comes out beside the spread of Lambertian light, (3, n) on the cosines of
-    `lobes`, all times φ_0.
-
-    On a lateral scale L the light that comes out is what enters less div(M) plus div div(Q), to second order
-    in the mean free path over L: (0) M along the way in, mm, the mean run; (1) Q of cos 2φ and sin 2φ, mm²,
-    the run's square being along the way only; (2) Q in all directions alike, mm², against its Lambertian
-    mean.
-
-    All collisions after the first forget where the light came from. With the plane albedo
-    R(µ) = ∫ exp(-τ/µ) P(τ) dτ/µ, P the share that comes out of the depth τ, the mean run to the first one is
-    sinθ (R + µ R')/(R µt') (near sinθ/µt' for a diffusing half-space, as Wang & Jacques measured: 1995; key
-    wang1995b), its mean square sin²θ (2 R + 4 µ R' + µ² R'')/(R µt'²). What the light spreads from its first
-    collision on is -4 dR^/dk² at k = 0 of a source exp(-z/µ).
-    """
-    cosine = np.linspace(0.0, 1.0, tissue.lobes.shape[1])
-    mu, weight = cosines()
-    even = 2.0 * mu * weight
-    plane = tissue.lobes[0]
-    slope = np.gradient(plane, cosine)
-    bend = np.gradient(slope, cosine)
-    sine2 = 1.0 - cosine**2
-    run = np.sqrt(sine2) * (plane + cosine * slope)
-    square = sine2 * (2.0 * plane + 4.0 * cosine * slope + cosine**2 * bend)
-    strength = max(tissue.reflectance, _LEAST)
-    depth = np.interp(cosine, mu, tissue.slab.spread() / strength)
-    # Lambertian light as a whole is left as the kernel has it
-    round_ = square + depth
-    round_ = round_ - plane * (np.interp(mu, cosine, round_) @ even)
-    scale = 1.0 / tissue.transport_per_mm
-    return np.stack([scale * run, 0.25 * scale**2 * square, 0.25 * scale**2 * round_])
+    return Coupling(lobes, held, gain, scale, free, apart, ways)
 
 
 def _passed_by_bare_skin(tissue: TissueOptics, n_tissue: float) -> Array:

@@ -16,6 +16,7 @@ from . import trace
 from .bsdf import Table
 from .gather import meet
 from .irradiance import AngularBasis, Entrance, smooth, transmitted
+from .passage import Passage
 from .sensor import Led, Sensor
 from .spread import Spread
 from .tissue import Coupling
@@ -24,6 +25,7 @@ Array = NDArray[np.float64]
 
 GRID = 200  # cells of the maps per side
 MARGIN = 20  # cells beside them, in which light comes out of bare skin
+INSIDE = slice(MARGIN, MARGIN + GRID)
 _ORDERS = 12  # of re-emission at most
 _ENOUGH = 3e-3  # share of the light below which the orders to come are estimated
 
@@ -33,6 +35,7 @@ class Behind:
     """What lies behind the contact, and how light spreads in it."""
 
     coupling: Coupling
+    passage: Passage
     spread: Spread
 
 
@@ -60,6 +63,8 @@ class Light:
     ----------
     upward : (n_led, modes, GRID, GRID)
         Light that goes up inside the tissue towards the contact surface, V_i of `tissue`, W/mm².
+    seen : (n_led, GRID + 2 MARGIN, GRID + 2 MARGIN)
+        π times the radiance in the tissue along the normal, towards the camera, W/mm², with the margin.
     sinks : (n_led, len(trace.SINKS))
         W that end there; "tissue" is what the tissue keeps.
     trapped : (n_led,)
@@ -69,6 +74,7 @@ class Light:
     """
 
     upward: Array
+    seen: Array
     sinks: Array
     trapped: Array
     traced: Array
@@ -114,7 +120,7 @@ def transport(
         Seed of every random choice; the result depends on nothing else, not even on the number of threads.
     """
     n_led = len(sensor.leds)
-    entrance = Entrance.at(basis, ground.fraction, sensor.guide.width_mm)
+    under = _Under(Entrance.at(basis, ground.fraction), behind, ground)
     flux = np.array([led.flux_W for led in sensor.leds])
     starts = np.random.Generator(np.random.Philox(seed)).integers(0, 2**32, size=(_ORDERS + 1, 4))
 
@@ -141,36 +147,36 @@ def transport(
     each = max(samples // 2, 1)
     maps, sinks, trapped, _ = walk(0, each, None)
     traced = smooth(maps, GRID // trace.CELLS)
-    total = newest = _spread(entrance, behind, ground, straight + traced)
     landed = straight + traced
+    newest = under.upward(under.entering(landed))[..., INSIDE, INSIDE]
+    total = newest[:, 0].sum(axis=(1, 2))
     ratio = np.ones(n_led)
     for order in range(1, _ORDERS + 1):
         before = newest[:, 0].sum(axis=(1, 2))
-        if (before * ratio).sum() <= _ENOUGH * total[:, 0].sum():
+        if (before * ratio).sum() <= _ENOUGH * total.sum():
             break
         maps, more, _, begun = walk(order, max(each >> min(2 * order, 6), 2), newest)
         sinks = sinks + more
         sinks[:, 0] -= begun
         landed = smooth(maps, GRID // trace.CELLS)
-        newest = _spread(entrance, behind, ground, landed)
-        total, traced = total + newest, traced + landed
+        newest = under.upward(under.entering(landed))[..., INSIDE, INSIDE]
         ratio = newest[:, 0].sum(axis=(1, 2)) / np.maximum(before, 1e-300)
+        total, traced = total + before * ratio, traced + landed
     # each order is like the one before by now: the rest is a geometric series
     ratio = np.clip(ratio, 0.0, 0.9)
-    rest = (ratio / (1.0 - ratio))[:, None, None, None]
-    return Light(total + newest * rest, sinks, trapped, traced + landed * rest)
+    traced = traced + landed * (ratio / (1.0 - ratio))[:, None, None, None]
+    return Light(*under.seen(straight + traced), sinks, trapped, traced)
 
 
 def again(
     sensor: Sensor, basis: AngularBasis, behind: Behind, ground: Ground, straight: Array, traced: Array
 ) -> Array:
-    """Light that goes up in the tissue, `Light.upward`, with the `traced` light of another press.
+    """Light towards the camera, `Light.seen`, with the `traced` light of another press.
 
     What an inclusion changes in it is small: light that has walked far through the guide tells of the whole
     press, and is 5 % of what enters the contact where LEDs shine in from air.
     """
-    entrance = Entrance.at(basis, ground.fraction, sensor.guide.width_mm)
-    return _spread(entrance, behind, ground, straight + traced)
+    return _Under(Entrance.at(basis, ground.fraction), behind, ground).seen(straight + traced)[1]
 
 
 def _first_leg(led: Led) -> int:
@@ -180,8 +186,32 @@ def _first_leg(led: Led) -> int:
     return trace.IN_AIR if led.coupling == "air" else trace.IN_GUIDE
 
 
-def _spread(entrance: Entrance, behind: Behind, ground: Ground, landed: Array) -> Array:
-    """Light that goes up in the tissue, (n_led, modes, GRID, GRID), from weighted irradiance."""
-    entering = transmitted(entrance, landed * ground.meets, MARGIN)
-    fraction = np.pad(ground.fraction, MARGIN, constant_values=np.nan)
-    return behind.spread.solve(entering, fraction)[..., MARGIN:-MARGIN, MARGIN:-MARGIN]
+@dataclass(frozen=True)
+class _Under:
+    """The tissue under one contact."""
+
+    entrance: Entrance
+    behind: Behind
+    ground: Ground
+
+    def entering(self, landed: Array) -> Array:
+        """What enters of weighted irradiance (n_led, layers, GRID, GRID), weighed as `transmitted` does."""
+        return transmitted(self.entrance, landed * self.ground.meets)
+
+    def upward(self, entering: Array) -> Array:
+        """Light that goes up in the tissue, (n_led, modes, ...) with the margin."""
+        modes = len(self.behind.coupling.lobes)
+        wide = np.pad(entering[:, :modes], ((0, 0), (0, 0), (MARGIN, MARGIN), (MARGIN, MARGIN)))
+        wide[:, 0] = self.behind.passage.enter(entering)
+        return self.behind.spread.solve(wide, self._fraction)
+
+    def seen(self, landed: Array) -> tuple[Array, Array]:
+        """`Light.upward` and `Light.seen`."""
+        entering = self.entering(landed)
+        upward = self.upward(entering)
+        seen = self.behind.passage.towards_camera(entering, upward, self._fraction)
+        return upward[..., INSIDE, INSIDE], seen
+
+    @property
+    def _fraction(self) -> Array:
+        return np.pad(self.ground.fraction, MARGIN, constant_values=np.nan)

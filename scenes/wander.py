@@ -19,13 +19,18 @@ from numpy.typing import NDArray
 from .bsdf import Table
 from .faces import Meeting
 from .sensor import Sensor
-from .walk import Body, Medium, Scores, roam
+from .walk import Body, Medium, Scores, fresnel, roam
 
 _LEAST = 1e-6  # of a chance that is divided by: what is rarer never happens
 
 
 class View(Protocol):
-    """What collects light that leaves towards it."""
+    """What collects light that leaves towards it.
+
+    Its rays spread by `spread_per_mm` of their slope for each mm aside: what lies deeper is seen from farther.
+    """
+
+    spread_per_mm: float
 
     def towards(self, point: mi.Point3f) -> mi.Vector3f:
         """Direction, down, from a point to the viewer, with z = -1."""
@@ -58,6 +63,10 @@ class Spots:
             )
         ]
         return Spots(maps[0], maps[1], sensor.guide.width_mm)
+
+    def covers(self, point: mi.Point3f) -> mi.Bool:
+        """Whether the guide lies there, not bare skin."""
+        return dr.maximum(dr.abs(point.x), dr.abs(point.y)) < 0.5 * self.width_mm
 
     def at(self, point: mi.Point3f) -> mi.Float:
         """Contact fraction."""
@@ -112,6 +121,7 @@ def wander(
     """
     body = body_of(sensor)
     index = sensor.guide.refractive_index / behind(sensor)
+    bare = fresnel(behind(sensor), 1.0)
     frame = mi.Frame3f(met.normal)
     here = frame.to_local(met.d)
 
@@ -119,9 +129,11 @@ def wander(
         return met.p + frame.to_world(mi.Vector3f(place.x, place.y, -place.z))
 
     def steep(where: mi.Point3f, cosine: mi.Float) -> tuple[mi.Float, mi.Float]:
-        square = 1.0 - (1.0 - dr.square(cosine)) / index**2
-        found = table.steep(spots.at(world(where)), dr.safe_sqrt(square))
-        return tuple(dr.select(square > 0.0, one, 0.0) for one in found)
+        square, place = 1.0 - (1.0 - dr.square(cosine)) / index**2, world(where)
+        found = table.steep(spots.at(place), dr.safe_sqrt(square))
+        touched = tuple(dr.select(square > 0.0, one, 0.0) for one in found)
+        covered, free = spots.covers(place), (bare(place, cosine), 0.0)
+        return tuple(dr.select(covered, one, other) for one, other in zip(touched, free, strict=True))
 
     def passing(where: mi.Point3f, cosine: mi.Float) -> mi.Float:
         return steep(where, cosine)[0]
@@ -144,10 +156,12 @@ def wander(
             through, slope = table.steep(spots.at(leaves), out.z, collides)
             bend = phase(g, dr.dot(way, mi.Vector3f(aim_x, aim_y, -up)))
             amount = throughput * share * bend * dr.exp(-body.medium.extinction_per_mm * run) / up
-            amount *= out.z * length
+            # a pixel sees more of what lies deeper; its radiance is that of the area it sees at the face
+            amount *= out.z * length * dr.square(1.0 - view.spread_per_mm * index * dr.maximum(where.z, 0.0))
             changes = zip(so_far, spots.derivatives(leaves), strict=True)
             slopes = [amount * (through * score + slope * change) for score, change in changes]
-            view.add(number, leaves, [amount * through, *slopes], collides & (out.z > 0.0) & (up > 0.0))
+            seen = collides & (out.z > 0.0) & (up > 0.0) & spots.covers(leaves)
+            view.add(number, leaves, [amount * through, *slopes], seen)
 
     flat = mi.Vector2f(here.x, here.y) * index
     way = mi.Vector3f(flat.x, flat.y, dr.safe_sqrt(1.0 - dr.squared_norm(flat)))
