@@ -29,6 +29,7 @@ _FINE_PER_MM = 1.5  # wave number of what is seen about half: light on a contact
 _AZIMUTHS, _WAVES = 24, 60
 _TOP = 25.0  # of k, 1/mean free path: beyond, all fall as 1/k
 _GRAZING = 0.1  # cosine below which little gets through any contact
+_NEARLY = 0.01  # of a cosine: step of the derivative at the normal
 _DARK = 1e-4  # answer whose parts do not matter
 ALL, STEEP = 0, 1
 """What is asked of the light that comes out: all of it, or its radiance factor along the normal."""
@@ -46,15 +47,18 @@ class Aslant:
         X_mr of what `ALL` leaves, over the transform of Lambertian light, and of what leaves `STEEP`.
     lambertian : (K,)
         X of Lambertian light, STEEP.
-    run_mm
-        How far behind, per sine of the angle in the tissue, light lies that leaves nearly along the normal.
+    behind : (r_0,), behind_lambertian
+        For light that leaves not quite along the normal: how far behind, mm per sine of the angle in the
+        tissue, the place is from which it seems to come, times its radiance factor. By functions of harmonic
+        0, and of Lambertian light.
     """
 
     transport_per_mm: float
     functions: tuple[Array, ...]
     transforms: tuple[Array, ...]
     lambertian: Array
-    run_mm: float
+    behind: Array
+    behind_lambertian: float
 
     def at(self, transforms: Array, wave_per_mm: Array, tail: float) -> Array:
         """Transforms (..., K) at wave numbers, 1/mm: (..., *shape); beyond the last as k^-tail."""
@@ -89,9 +93,16 @@ def aslant(body: Slab, transport_per_mm: float, lobes: Array) -> Aslant:
         more = CubicSpline(cosine, shapes[:count] / seen, axis=1)(grid)
         functions.append(np.vstack([lobes, more]) if m == 0 else more)
     lambertian = by_harmonic[STEEP, :, :, 0].real @ (2.0 * cosine * weight)
-    # the mean run to the first collision is sinθ (R + µ R')/(R µt') of the plane albedo R (see `walk`'s tests)
-    run = (1.0 + np.gradient(lobes[0], grid)[-1] / max(lobes[0, -1], _DARK)) / transport_per_mm
-    return Aslant(transport_per_mm, tuple(functions), tuple(transforms), lambertian, float(run))
+    # by reciprocity the run from the last collision is like that to the first one: with the radiance factor
+    # F(µ) = ∫ exp(-τ/µ) P(τ) dτ/µ its mean is sinθ (F + µ F')/(F µt')
+    near = 1.0 - np.array([_NEARLY, 0.0])
+    steep, normal = body.factors(near)
+    run = (normal + (normal - steep) / _NEARLY) / transport_per_mm
+    behind = np.linalg.lstsq(
+        (np.stack([np.interp(cosine, grid, one) for one in functions[0]]) * seen).T, run * seen, rcond=None
+    )[0]
+    of_lambertian = float(run @ (2.0 * cosine * weight))
+    return Aslant(transport_per_mm, tuple(functions), tuple(transforms), lambertian, behind, of_lambertian)
 
 
 @lru_cache(maxsize=16)

@@ -16,6 +16,7 @@ from .bsdf import Table
 from .build import led_frame, radiance
 from .irradiance import look_up
 from .lamp import Patterns
+from .passage import Seen
 from .sensor import Sensor
 from .tissue import Coupling
 from .view import PixelRays, faces_reflectance
@@ -34,8 +35,12 @@ class Sight:
     position_mm : (rows, columns, 2)
         Point of the deformed surface that each pixel sees directly.
     points : list of (x, y, gain)
-        For each sight, on the device: where light comes from that is seen there, in units of the guide's
-        width (0..1 is the guide), and radiance at the camera per light that goes up in the tissue, 1/sr.
+        For each sight, on the device: position in units of the guide's width (0..1), and radiance at the
+        camera per light that goes up in the tissue, 1/sr.
+    lean : (x, y)
+        Direction of the pixels' rays in the tissue, up: sines along the face, over the guide's width, 1/mm.
+    off_normal
+        1 less the cosine of their angle in the tissue.
     windows : (sights, rows, columns)
         Radiance at the camera over that in the guide, for each sight.
     lamps : (n_led, rows, columns)
@@ -44,6 +49,8 @@ class Sight:
 
     position_mm: NDArray[np.float32]
     points: list[tuple[mi.Float, mi.Float, mi.Float]]
+    lean: tuple[mi.Float, mi.Float]
+    off_normal: mi.Float
     windows: NDArray[np.float32]
     lamps: NDArray[np.float32]
 
@@ -62,9 +69,9 @@ def look(scene: mi.Scene, sensor: Sensor, table: Table, coupling: Coupling, rays
     # the run in the glass and back, near the axis, as one in the guide
     in_glass = 2.0 * sensor.glass.thickness_mm * guide.refractive_index / sensor.glass.refractive_index
     lamps, patterns = [mi.Float(0.0) for _ in sensor.leds], Patterns(sensor.leds)
-    points, windows, position = [], [], ()
-    # light that leaves aslant has come from below, a run behind; by Snell's law of this sine in the tissue
-    behind = float(coupling.aslant.run_mm * np.sqrt(coupling.scale))
+    points, windows = [], []
+    # sine of the angle in the tissue, by Snell's law
+    bend = float(np.sqrt(coupling.scale)) / guide.width_mm
     start = mi.Point3f(*origin) + _STEP_MM / direction.z * direction
     for _ in range(_SIGHTS):
         si = meet(scene, named["contact"], start, direction)
@@ -75,15 +82,7 @@ def look(scene: mi.Scene, sensor: Sensor, table: Table, coupling: Coupling, rays
         fraction = dr.select(seen, contact.eval_attribute_1("vertex_contact_fraction", si, seen), 0.0)
         transmitted = table.transmittance(fraction, cosine, seen)
         emitted = dr.select(seen, gain * transmitted * (coupling.scale * dr.inv_pi), 0.0)
-        emitted *= table.lobes(cosine, seen)[0] / float(coupling.lobes[0, -1])
-        points.append(
-            (
-                (si.p.x + behind * direction.x) / guide.width_mm + 0.5,
-                (si.p.y + behind * direction.y) / guide.width_mm + 0.5,
-                emitted,
-            )
-        )
-        position = position or (si.p.x, si.p.y)
+        points.append((si.p.x / guide.width_mm + 0.5, si.p.y / guide.width_mm + 0.5, emitted))
         # mirrored in the contact surface, down, mirrored in the lower faces, up again; the slope left out
         gain = dr.select(seen, gain * (1.0 - transmitted), 0.0)
         down = mi.Vector3f(direction.x, direction.y, -direction.z)
@@ -97,11 +96,15 @@ def look(scene: mi.Scene, sensor: Sensor, table: Table, coupling: Coupling, rays
             run * direction.x, run * direction.y, 0.0
         )
         start += _STEP_MM / direction.z * direction
-    dr.eval(points, windows, lamps, position)
-    seen_at = np.stack([np.asarray(at).reshape(shape) for at in position], axis=-1)
+    lean = (bend * direction.x, bend * direction.y)
+    sine2 = coupling.scale * (dr.square(direction.x) + dr.square(direction.y))
+    off_normal = 1.0 - dr.sqrt(dr.maximum(1.0 - sine2, 0.0))
+    dr.eval(points, windows, lamps, lean, off_normal)
+    x, y = (np.asarray(points[0][i]).reshape(shape) for i in (0, 1))
+    position = (np.stack([x, y], axis=-1) - 0.5) * guide.width_mm
     layers = np.stack([np.broadcast_to(np.asarray(layer), rays.transmittance.size).reshape(shape) for layer in lamps])
     through = np.stack([np.asarray(window).reshape(shape) for window in windows])
-    return Sight(seen_at.astype(np.float32), points, through, layers)
+    return Sight(position.astype(np.float32), points, lean, off_normal, through, layers)
 
 
 def meet(
@@ -186,18 +189,18 @@ def _fresnel(n_in: float, n_out: float, square: mi.Float) -> mi.Float:
     return dr.select(square < n_out**2, 0.5 * (dr.square(s) + dr.square(p)), 1.0)
 
 
-def picture(sight: Sight, seen: NDArray[np.float64], margin: int) -> NDArray[np.float32]:
-    """Radiance in air at the pixels, (n_led, rows, columns), in W m⁻² sr⁻¹.
-
-    `seen` (n_led, m, m), W/mm², is the light that goes up in the tissue towards the camera, on cells [iy, ix]
-    of the guide's face with `margin` cells beside it.
-    """
-    n_led, cells = len(seen), seen.shape[-1]
+def picture(sight: Sight, seen: Seen, margin: int) -> NDArray[np.float32]:
+    """Radiance in air at the pixels, (n_led, rows, columns), in W m⁻² sr⁻¹; `margin` cells of what is seen lie
+    beside the guide's face on each side."""
+    n_led, cells = len(seen.maps), seen.maps.shape[-1]
+    inside = 1.0 - 2.0 * margin / cells
     total = [mi.Float(0.0) for _ in range(n_led)]
     for x, y, gain in sight.points:
-        x, y = (at * (1.0 - 2.0 * margin / cells) + margin / cells for at in (x, y))
-        for led, layer in enumerate(look_up(seen, x, y)):
-            total[led] += gain * layer
+        for led, behind in enumerate(seen.behind_mm):
+            away = dr.opaque(mi.Float, float(behind))
+            place = [inside * (at + away * lean) + margin / cells for at, lean in zip((x, y), sight.lean, strict=True)]
+            brighter = 1.0 + dr.opaque(mi.Float, float(seen.steeper[led])) * sight.off_normal
+            total[led] += gain * brighter * look_up(seen.maps[led][None], *place)[0]
     dr.eval(total)
     shape = (n_led, *sight.position_mm.shape[:2])
     found = np.stack([np.asarray(layer) for layer in total]).reshape(shape)

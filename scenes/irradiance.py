@@ -146,39 +146,49 @@ class Entrance:
     """An `AngularBasis` where the real contact fraction is (m, m), on cells over the guide's face."""
 
     basis: AngularBasis
-    rows: Array  # (m, m, functions, count)
-    turning: tuple[Array, ...]  # (m, m, functions, count) each
+    rows: NDArray[np.float32]  # (functions, count, m, m)
+    turning: tuple[NDArray[np.float32], ...]  # (functions, count, m, m) each
 
     @staticmethod
     def at(basis: AngularBasis, fraction: Array) -> Entrance:
-        every = (basis, *basis.turning)
-        rows = [by_fraction(np.moveaxis(one.rows, 0, 1), fraction) for one in every]
+        rows = [by_fraction(one.rows, fraction) for one in (basis, *basis.turning)]
         return Entrance(basis, rows[0], tuple(rows[1:]))
 
 
-def transmitted(entrance: Entrance, irradiance: Array) -> Array:
+def transmitted(entrance: Entrance, irradiance: Array, only: int | None = None) -> Array:
     """Irradiance that enters the tissue, weighed with each function of the angle of entry, W/mm².
 
     From maps (n, layers, m, m) on cells over the face; (n, functions, m, m): those of harmonic 0, and of each
-    harmonic after it its functions with the cosine of the azimuth, and again with the sine.
+    harmonic after it its functions with the cosine of the azimuth, and again with the sine; or the first
+    `only`.
     """
-    first = len(entrance.basis.columns)
-    found = [np.einsum("yxik,nkyx->niyx", entrance.rows, irradiance[:, :first], optimize=True)]
-    for part, rows in zip(entrance.basis.turning, entrance.turning, strict=True):
+    basis, cells = entrance.basis, irradiance.shape[-1]
+    maps = np.moveaxis(irradiance, 1, 0).reshape(irradiance.shape[1], -1, cells, cells).astype(np.float32)
+    found, first = [], len(basis.columns)
+
+    def summed(rows: NDArray[np.float32], begin: int) -> None:
+        for row in rows[:only]:
+            total = row[0] * maps[begin]
+            for k in range(1, len(row)):
+                total += row[k] * maps[begin + k]
+            found.append(total)
+
+    summed(entrance.rows, 0)
+    for rows in () if only else entrance.turning:
         for _ in ("cosine", "sine"):
-            maps = irradiance[:, first : first + len(part.columns)]
-            first += len(part.columns)
-            found.append(np.einsum("yxik,nkyx->niyx", rows, maps, optimize=True))
-    return np.concatenate(found, axis=1)
+            summed(rows, first)
+            first += rows.shape[1]
+    return np.stack(found, axis=1).astype(np.float64)
 
 
-def by_fraction(rows: Array, fraction: Array) -> Array:
-    """Rows (n_fraction, ...) of a table, uniform on 0..1, at fractions (m, m): (m, m, ...)."""
-    last = len(rows) - 1
+def by_fraction(rows: Array, fraction: Array) -> NDArray[np.float32]:
+    """Rows (functions, n_fraction, count), uniform on 0..1, at fractions (m, m): (functions, count, m, m)."""
+    last = rows.shape[1] - 1
     at = np.clip(fraction, 0.0, 1.0) * last
     node = np.minimum(at.astype(np.int64), last - 1)
-    share = (at - node).reshape(*fraction.shape, *(1,) * (rows.ndim - 1))
-    return np.asarray(rows[node] * (1.0 - share) + rows[node + 1] * share)
+    share = (at - node).astype(np.float32)
+    table = np.moveaxis(rows, 1, 2).astype(np.float32)
+    return np.asarray(table[..., node] * (1.0 - share) + table[..., node + 1] * share)
 
 
 def smooth(irradiance: Array, factor: int = 4) -> Array:

@@ -20,6 +20,35 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
+class Glimpse:
+    """What of the first pass leaves along the normal: Fourier transforms (n, p, p // 2 + 1), and the sums of
+    light times how far behind it lies, (n,) as `Aslant.behind`."""
+
+    spectra: NDArray[np.complex64]
+    behind: Array
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Light that leaves towards the camera.
+
+    Attributes
+    ----------
+    maps : (n, m, m)
+        π times the radiance in the tissue along the normal, W/mm², on cells [iy, ix] of the guide's face and
+        a margin beside it.
+    behind_mm : (n,)
+        How far behind, mm per sine of the angle in the tissue, light is to be looked up that leaves aslant.
+    steeper : (n,)
+        Its relative rise per 1 - cosine: what leaves aslant has come from less deep.
+    """
+
+    maps: Array
+    behind_mm: Array
+    steeper: Array
+
+
+@dataclass(frozen=True)
 class Passage:
     """The kernels of one tissue on one grid of square cells; make it with `passage`.
 
@@ -37,6 +66,8 @@ class Passage:
         W of `tissue.Coupling`.
     local : (modes,)
         What a mode's light adds towards the camera where it entered; 0 for the first.
+    transport_per_mm, behind, behind_lambertian
+        Of `aslant.Aslant`.
     """
 
     entering: NDArray[np.complex64]
@@ -47,19 +78,29 @@ class Passage:
     held: Array
     free: Array
     local: Array
+    transport_per_mm: float
+    behind: Array
+    behind_lambertian: float
 
-    def enter(self, maps: Array) -> Array:
-        """Lambertian irradiance that would come out as what enters does, (n, cells, cells) with the margin,
-        from maps (n, functions, m, m), W/mm²."""
-        return np.stack([self._back((self._forth(one) * self.entering).sum(axis=0)) for one in maps])
+    def enter(self, maps: Array) -> tuple[Array, Glimpse]:
+        """From maps (n, functions, m, m) of what enters, W/mm²: Lambertian irradiance that would come out as it
+        does, (n, cells, cells) with the margin; and what of the first pass leaves along the normal."""
+        entering, glimpse = [], []
+        for one in maps:
+            spectra = self._forth(one)
+            entering.append(self._back(np.einsum("kyx,kyx->yx", spectra, self.entering)))
+            glimpse.append(np.einsum("kyx,kyx->yx", spectra, self.seen))
+        rings = self.behind.size
+        behind = maps[:, :rings].sum(axis=(2, 3)) @ self.behind
+        return np.stack(entering), Glimpse(np.stack(glimpse), behind)
 
-    def towards_camera(self, maps: Array, upward: Array, fraction: Array) -> Array:
-        """Light that goes up along the normal, π L, (n, cells, cells) W/mm² with the margin.
+    def towards_camera(self, glimpse: Glimpse, upward: Array, fraction: Array) -> Seen:
+        """What leaves towards the camera.
 
         Parameters
         ----------
-        maps
-            All that has entered, as for `enter`.
+        glimpse
+            From `enter`.
         upward : (n, modes, cells, cells)
             V, from `spread`.
         fraction : (cells, cells)
@@ -67,18 +108,18 @@ class Passage:
         """
         bare = np.isnan(fraction)
         nodes, fraction = np.linspace(0.0, 1.0, len(self.held)), np.where(bare, 0.0, fraction)
-        found = np.empty((len(maps), *fraction.shape))
-        held = np.stack(
-            [
-                [np.where(bare, self.free[i, j], np.interp(fraction, nodes, self.held[:, i, j])) for j in row]
-                for i, row in enumerate(np.indices(self.free.shape)[1])
-            ]
-        )
-        for number, one in enumerate(maps):
-            thrown = np.einsum("ijyx,jyx->iyx", held, upward[number])
-            spectrum = (self._forth(one) * self.seen).sum(axis=0) + self.lambertian * self._forth(thrown[0])
-            found[number] = self._back(spectrum) + np.tensordot(self.local, thrown, 1)
-        return found
+        modes = range(len(self.free))
+        thrown = np.zeros_like(upward)
+        for i in modes:
+            for j in modes:
+                held = np.where(bare, self.free[i, j], np.interp(fraction, nodes, self.held[:, i, j]))
+                thrown[:, i] += held * upward[:, j]
+        seen = np.tensordot(thrown, self.local, (1, 0))
+        for number, (spectrum, again) in enumerate(zip(glimpse.spectra, thrown[:, 0], strict=True)):
+            seen[number] += self._back(spectrum + self.lambertian * self._forth(again))
+        behind = glimpse.behind + self.behind_lambertian * thrown[:, 0].sum(axis=(1, 2))
+        behind /= np.maximum(seen.sum(axis=(1, 2)), 1e-300)
+        return Seen(seen, behind, 1.0 - self.transport_per_mm * behind)
 
     def _forth(self, maps: Array) -> NDArray[np.complex64]:
         padded = len(self.lambertian)
@@ -108,4 +149,5 @@ def passage(tissue: TissueOptics, coupling: Coupling, width_mm: float, cells: in
     lambertian = apart.at(apart.lambertian, k, 1.0).astype(np.float32)
     local = tissue.strengths * tissue.lobes[:, -1] * (np.arange(tissue.strengths.size) > 0)
     entering, seen = (np.array(one, dtype=np.complex64) for one in kernels)
-    return Passage(entering, seen, lambertian, cells, margin, coupling.held, coupling.free, local)
+    of_exit = apart.transport_per_mm, apart.behind, apart.behind_lambertian
+    return Passage(entering, seen, lambertian, cells, margin, coupling.held, coupling.free, local, *of_exit)

@@ -16,7 +16,7 @@ from . import trace
 from .bsdf import Table
 from .gather import meet
 from .irradiance import AngularBasis, Entrance, smooth, transmitted
-from .passage import Passage
+from .passage import Passage, Seen
 from .sensor import Led, Sensor
 from .spread import Spread
 from .tissue import Coupling
@@ -63,8 +63,8 @@ class Light:
     ----------
     upward : (n_led, modes, GRID, GRID)
         Light that goes up inside the tissue towards the contact surface, V_i of `tissue`, W/mm².
-    seen : (n_led, GRID + 2 MARGIN, GRID + 2 MARGIN)
-        π times the radiance in the tissue along the normal, towards the camera, W/mm², with the margin.
+    seen
+        What of it goes to the camera, with the margin.
     sinks : (n_led, len(trace.SINKS))
         W that end there; "tissue" is what the tissue keeps.
     trapped : (n_led,)
@@ -74,7 +74,7 @@ class Light:
     """
 
     upward: Array
-    seen: Array
+    seen: Seen
     sinks: Array
     trapped: Array
     traced: Array
@@ -148,7 +148,7 @@ def transport(
     maps, sinks, trapped, _ = walk(0, each, None)
     traced = smooth(maps, GRID // trace.CELLS)
     landed = straight + traced
-    newest = under.upward(under.entering(landed))[..., INSIDE, INSIDE]
+    newest = under.seen(landed)[0]
     total = newest[:, 0].sum(axis=(1, 2))
     ratio = np.ones(n_led)
     for order in range(1, _ORDERS + 1):
@@ -159,7 +159,7 @@ def transport(
         sinks = sinks + more
         sinks[:, 0] -= begun
         landed = smooth(maps, GRID // trace.CELLS)
-        newest = under.upward(under.entering(landed))[..., INSIDE, INSIDE]
+        newest = under.again(landed)
         ratio = newest[:, 0].sum(axis=(1, 2)) / np.maximum(before, 1e-300)
         total, traced = total + before * ratio, traced + landed
     # each order is like the one before by now: the rest is a geometric series
@@ -170,7 +170,7 @@ def transport(
 
 def again(
     sensor: Sensor, basis: AngularBasis, behind: Behind, ground: Ground, straight: Array, traced: Array
-) -> Array:
+) -> Seen:
     """Light towards the camera, `Light.seen`, with the `traced` light of another press.
 
     What an inclusion changes in it is small: light that has walked far through the guide tells of the whole
@@ -194,23 +194,29 @@ class _Under:
     behind: Behind
     ground: Ground
 
-    def entering(self, landed: Array) -> Array:
-        """What enters of weighted irradiance (n_led, layers, GRID, GRID), weighed as `transmitted` does."""
-        return transmitted(self.entrance, landed * self.ground.meets)
+    def again(self, landed: Array) -> Array:
+        """Light that goes up in the tissue, (n_led, modes, GRID, GRID), as if it came out where it went in but
+        for its spread: enough for light that has been in the tissue before."""
+        return self._upward(transmitted(self.entrance, landed * self.ground.meets, self._modes), 1e-4)[0]
 
-    def upward(self, entering: Array) -> Array:
-        """Light that goes up in the tissue, (n_led, modes, ...) with the margin."""
-        modes = len(self.behind.coupling.lobes)
-        wide = np.pad(entering[:, :modes], ((0, 0), (0, 0), (MARGIN, MARGIN), (MARGIN, MARGIN)))
-        wide[:, 0] = self.behind.passage.enter(entering)
-        return self.behind.spread.solve(wide, self._fraction)
+    def seen(self, landed: Array) -> tuple[Array, Seen]:
+        """`Light.upward` and `Light.seen` of weighted irradiance (n_led, layers, GRID, GRID)."""
+        entering = transmitted(self.entrance, landed * self.ground.meets)
+        straight, glimpse = self.behind.passage.enter(entering)
+        inside, upward = self._upward(entering[:, : self._modes], 1e-6, straight)
+        return inside, self.behind.passage.towards_camera(glimpse, upward, self._fraction)
 
-    def seen(self, landed: Array) -> tuple[Array, Array]:
-        """`Light.upward` and `Light.seen`."""
-        entering = self.entering(landed)
-        upward = self.upward(entering)
-        seen = self.behind.passage.towards_camera(entering, upward, self._fraction)
-        return upward[..., INSIDE, INSIDE], seen
+    def _upward(self, entering: Array, tolerance: float, straight: Array | None = None) -> tuple[Array, Array]:
+        """V without the margin, and with it."""
+        wide = np.pad(entering, ((0, 0), (0, 0), (MARGIN, MARGIN), (MARGIN, MARGIN)))
+        if straight is not None:
+            wide[:, 0] = straight
+        found = self.behind.spread.solve(wide, self._fraction, tolerance)
+        return found[..., INSIDE, INSIDE], found
+
+    @property
+    def _modes(self) -> int:
+        return len(self.behind.coupling.lobes)
 
     @property
     def _fraction(self) -> Array:

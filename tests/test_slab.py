@@ -55,6 +55,34 @@ def test_transform_is_that_of_the_wiener_hopf_solution(k: float) -> None:
     assert Slab(albedo).reflectance(np.array([k]))[0] == pytest.approx(exact, rel=1e-5)
 
 
+@pytest.mark.parametrize("albedo", [0.3, 0.98])
+@pytest.mark.parametrize("k", [0.1, 1.0, 5.0])
+def test_beams_come_out_as_the_wiener_hopf_solution_says(albedo: float, k: float) -> None:
+    """a H(p) H(p') / (p + p') with the beam's complex p = 1/µ + i k tanθ cosφ and the exit's p': 1 along the
+    normal, q(µ') of all the directions of light that leaves."""
+    mu, azimuth = np.array([[0.1], [0.4], [0.9], [1.0]]), np.linspace(0.0, np.pi, 5)
+    p = 1.0 / mu + 1j * k * np.sqrt(1.0 - mu**2) / mu * np.cos(azimuth)
+    node, weight = cosines()
+    q, one = np.sqrt(node**-2 + k**2), np.ones(1)
+    h, leaving = h_function(p, albedo, k), weight * h_function(q, albedo, k)
+    everything = 0.5 * albedo * h / mu * (leaving / (p[..., None] + q)).sum(axis=-1)
+    steep = 0.25 * albedo * h / mu * h_function(one, albedo, k) / (p + 1.0)
+    found = Slab(albedo).aslant(np.array([k]), mu[:, 0], azimuth)[:, 0]
+    np.testing.assert_allclose(found, [everything, steep], atol=1e-6 * np.abs(everything).max())
+
+
+@pytest.mark.parametrize(
+    "layer", [Slab(0.98), Slab(0.98, 2.0), Slab(0.98, 2.0, 0.7), Slab(0.999, 0.3, 0.9), Slab(0.5, 1.0, 0.5)]
+)
+def test_beams_from_all_sides_are_lambertian_light(layer: Slab) -> None:
+    node, weight = cosines()
+    azimuth = 2.0 * np.pi * (np.arange(64) + 0.5) / 64
+    k = np.array([0.0, 0.3, 2.0])
+    everything, steep = (layer.aslant(k, node, azimuth).mean(axis=3) * 2.0 * node * weight).sum(axis=2)
+    np.testing.assert_allclose(everything, layer.reflectance(k), rtol=1e-6)
+    assert steep[0] == pytest.approx(layer.plane_albedo(np.ones(1))[0], rel=1e-6)  # by reciprocity
+
+
 # Isotropic scattering, no index step: (albedo, optical depth, normal incidence up and down, Lambertian up and
 # down) by adding and doubling (Prahl, van Gemert & Welch 1993; key prahl1993; iadpython 0.5.3 and its tests).
 ADDING_DOUBLING = [
