@@ -45,20 +45,16 @@ class Aslant:
         h_mr on cosines in the tissue uniform on 0..1; in harmonic 0 the tissue's lobes φ_i come first.
     transforms : by harmonic m, (2, r_m, K)
         X_mr of what `ALL` leaves, over the transform of Lambertian light, and of what leaves `STEEP`.
-    lambertian : (K,)
-        X of Lambertian light, STEEP.
-    behind : (r_0,), behind_lambertian
+    behind : (r_0,)
         For light that leaves not quite along the normal: how far behind, mm per sine of the angle in the
-        tissue, the place is from which it seems to come, times its radiance factor. By functions of harmonic
-        0, and of Lambertian light.
+        tissue, the place is from which it seems to come, times its radiance factor; by functions of harmonic
+        0.
     """
 
     transport_per_mm: float
     functions: tuple[Array, ...]
     transforms: tuple[Array, ...]
-    lambertian: Array
     behind: Array
-    behind_lambertian: float
 
     def at(self, transforms: Array, wave_per_mm: Array, tail: float) -> Array:
         """Transforms (..., K) at wave numbers, 1/mm: (..., *shape); beyond the last as k^-tail."""
@@ -70,7 +66,7 @@ class Aslant:
 def aslant(body: Slab, transport_per_mm: float, lobes: Array) -> Aslant:
     """Take the answer of a body apart: `lobes` (modes, n) are its φ_i on cosines uniform on 0..1."""
     beams, diffuse = _beams(body)
-    cosine, weight = cosines()
+    cosine, _ = cosines()
     by_harmonic = np.fft.fft(beams, axis=3) / _AZIMUTHS
     peak = np.maximum(np.abs(beams).max(axis=(1, 2, 3)), _DARK)[:, None, None]
     seen = cosine / (cosine + _GRAZING)
@@ -87,12 +83,13 @@ def aslant(body: Slab, transport_per_mm: float, lobes: Array) -> Aslant:
         left, sizes, shapes = np.linalg.svd(flat - share @ known, full_matrices=False)
         rest = [np.abs((left[:, n:] * sizes[n:]) @ shapes[n:]).max() for n in range(sizes.size)]
         count = int(np.argmax(np.array(rest) <= _ENOUGH))
-        shares = np.hstack([share, left[:, :count] * sizes[:count]]).reshape(2, diffuse.size, -1) / fine * peak
+        shares = (
+            np.hstack([share, left[:, :count] * sizes[:count]]).reshape(2, diffuse.size, -1) / fine * peak
+        )
         shares[ALL] /= np.maximum(diffuse, 1e-300)[:, None]
         transforms.append(np.moveaxis(shares, 1, 2))
         more = CubicSpline(cosine, shapes[:count] / seen, axis=1)(grid)
         functions.append(np.vstack([lobes, more]) if m == 0 else more)
-    lambertian = by_harmonic[STEEP, :, :, 0].real @ (2.0 * cosine * weight)
     # by reciprocity the run from the last collision is like that to the first one: with the radiance factor
     # F(µ) = ∫ exp(-τ/µ) P(τ) dτ/µ its mean is sinθ (F + µ F')/(F µt')
     near = 1.0 - np.array([_NEARLY, 0.0])
@@ -101,8 +98,7 @@ def aslant(body: Slab, transport_per_mm: float, lobes: Array) -> Aslant:
     behind = np.linalg.lstsq(
         (np.stack([np.interp(cosine, grid, one) for one in functions[0]]) * seen).T, run * seen, rcond=None
     )[0]
-    of_lambertian = float(run @ (2.0 * cosine * weight))
-    return Aslant(transport_per_mm, tuple(functions), tuple(transforms), lambertian, behind, of_lambertian)
+    return Aslant(transport_per_mm, tuple(functions), tuple(transforms), behind)
 
 
 @lru_cache(maxsize=16)

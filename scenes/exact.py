@@ -103,7 +103,9 @@ class _View:
         maps = mi.Texture2f(mi.TensorXf(stacked), wrap_mode=dr.WrapMode.Clamp)
         layers = dr.zeros(mi.Int64, len(sensor.leds) * rows * columns * many)
         width, middle = sensor.guide.width_mm, _MAP // 2
-        spread = (film.lean[middle, middle + 1, 0] - film.lean[middle, middle - 1, 0]) * (_MAP - 1) / width / 2
+        spread = (
+            (film.lean[middle, middle + 1, 0] - film.lean[middle, middle - 1, 0]) * (_MAP - 1) / width / 2
+        )
         return _View(maps, rows, columns, width, many, layers, float(spread))
 
     def _look_up(self, x: mi.Float, y: mi.Float) -> list[mi.Float]:

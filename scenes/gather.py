@@ -102,7 +102,9 @@ def look(scene: mi.Scene, sensor: Sensor, table: Table, coupling: Coupling, rays
     dr.eval(points, windows, lamps, lean, off_normal)
     x, y = (np.asarray(points[0][i]).reshape(shape) for i in (0, 1))
     position = (np.stack([x, y], axis=-1) - 0.5) * guide.width_mm
-    layers = np.stack([np.broadcast_to(np.asarray(layer), rays.transmittance.size).reshape(shape) for layer in lamps])
+    layers = np.stack(
+        [np.broadcast_to(np.asarray(layer), rays.transmittance.size).reshape(shape) for layer in lamps]
+    )
     through = np.stack([np.asarray(window).reshape(shape) for window in windows])
     return Sight(position.astype(np.float32), points, lean, off_normal, through, layers)
 
@@ -190,15 +192,19 @@ def _fresnel(n_in: float, n_out: float, square: mi.Float) -> mi.Float:
 
 
 def picture(sight: Sight, seen: Seen, margin: int) -> NDArray[np.float32]:
-    """Radiance in air at the pixels, (n_led, rows, columns), in W m⁻² sr⁻¹; `margin` cells of what is seen lie
-    beside the guide's face on each side."""
+    """Radiance in air at the pixels, (n_led, rows, columns), in W m⁻² sr⁻¹; so many cells of what is seen lie
+    beside the guide's face on each side.
+    """
     n_led, cells = len(seen.maps), seen.maps.shape[-1]
     inside = 1.0 - 2.0 * margin / cells
     total = [mi.Float(0.0) for _ in range(n_led)]
     for x, y, gain in sight.points:
         for led, behind in enumerate(seen.behind_mm):
             away = dr.opaque(mi.Float, float(behind))
-            place = [inside * (at + away * lean) + margin / cells for at, lean in zip((x, y), sight.lean, strict=True)]
+            place = [
+                inside * (at + away * lean) + margin / cells
+                for at, lean in zip((x, y), sight.lean, strict=True)
+            ]
             brighter = 1.0 + dr.opaque(mi.Float, float(seen.steeper[led])) * sight.off_normal
             total[led] += gain * brighter * look_up(seen.maps[led][None], *place)[0]
     dr.eval(total)

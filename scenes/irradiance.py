@@ -19,6 +19,7 @@ from .contact import ContactOptics
 from .tissue import Coupling
 
 Array = NDArray[np.float64]
+Singles = NDArray[np.float32]
 
 _SMOOTHING_CELLS = 2.5  # standard deviation of the smoothing kernel
 _RIM_CELLS = 2  # 0.5 mm
@@ -26,8 +27,8 @@ _RIM_CELLS = 2  # 0.5 mm
 
 @dataclass(frozen=True)
 class Turning:
-    """Separable form of what turns with the azimuth, h_r(cos) T(A_r, cos) = sum_k rows[r, :, k] columns[k](cos),
-    each with a part of the cosine and one of the sine of the azimuth times the harmonic."""
+    """Separable form of what turns with the azimuth: h_r(cos) T(A_r, cos) = sum_k rows[r, :, k]
+    columns[k](cos), a part with the cosine of the azimuth times the harmonic, and one with its sine."""
 
     harmonic: int
     rows: Array  # (functions, n_fraction, count)
@@ -111,7 +112,7 @@ def angular_basis(
     """Truncated singular value decompositions; largest errors at most `tolerance` for the lobes, and
     `turning` of the largest answer of the tissue for all other parts."""
     modes, apart = len(coupling.lobes), coupling.aslant
-    largest = max(float(np.abs(apart.lambertian).max()), 1e-12)
+    largest = max(float(np.abs(apart.transforms[0][STEEP, 0]).max()), 1e-12)
     found = []
     for m, (ways, spread) in enumerate(zip(coupling.ways, apart.transforms, strict=True)):
         if len(ways):
@@ -146,27 +147,27 @@ class Entrance:
     """An `AngularBasis` where the real contact fraction is (m, m), on cells over the guide's face."""
 
     basis: AngularBasis
-    rows: NDArray[np.float32]  # (functions, count, m, m)
-    turning: tuple[NDArray[np.float32], ...]  # (functions, count, m, m) each
+    rows: Singles  # (functions, count, m, m)
+    turning: tuple[Singles, ...]  # (functions, count, m, m) each
 
     @staticmethod
     def at(basis: AngularBasis, fraction: Array) -> Entrance:
-        rows = [by_fraction(one.rows, fraction) for one in (basis, *basis.turning)]
+        rows = [by_fraction(one, fraction) for one in (basis.rows, *(part.rows for part in basis.turning))]
         return Entrance(basis, rows[0], tuple(rows[1:]))
 
 
-def transmitted(entrance: Entrance, irradiance: Array, only: int | None = None) -> Array:
+def transmitted(entrance: Entrance, irradiance: NDArray[np.floating], only: int | None = None) -> Array:
     """Irradiance that enters the tissue, weighed with each function of the angle of entry, W/mm².
 
     From maps (n, layers, m, m) on cells over the face; (n, functions, m, m): those of harmonic 0, and of each
     harmonic after it its functions with the cosine of the azimuth, and again with the sine; or the first
     `only`.
     """
-    basis, cells = entrance.basis, irradiance.shape[-1]
-    maps = np.moveaxis(irradiance, 1, 0).reshape(irradiance.shape[1], -1, cells, cells).astype(np.float32)
+    basis = entrance.basis
+    maps = np.moveaxis(irradiance, 1, 0).astype(np.float32, copy=False)
     found, first = [], len(basis.columns)
 
-    def summed(rows: NDArray[np.float32], begin: int) -> None:
+    def summed(rows: Singles, begin: int) -> None:
         for row in rows[:only]:
             total = row[0] * maps[begin]
             for k in range(1, len(row)):
@@ -181,7 +182,7 @@ def transmitted(entrance: Entrance, irradiance: Array, only: int | None = None) 
     return np.stack(found, axis=1).astype(np.float64)
 
 
-def by_fraction(rows: Array, fraction: Array) -> NDArray[np.float32]:
+def by_fraction(rows: Array, fraction: Array) -> Singles:
     """Rows (functions, n_fraction, count), uniform on 0..1, at fractions (m, m): (functions, count, m, m)."""
     last = rows.shape[1] - 1
     at = np.clip(fraction, 0.0, 1.0) * last
@@ -191,17 +192,14 @@ def by_fraction(rows: Array, fraction: Array) -> NDArray[np.float32]:
     return np.asarray(table[..., node] * (1.0 - share) + table[..., node + 1] * share)
 
 
-def smooth(irradiance: Array, factor: int = 4) -> Array:
+def smooth(irradiance: Singles, factor: int = 4) -> Singles:
     """Smoothed irradiance on a grid `factor` times finer over the last two axes.
 
     The kernel 2 G - G * G has no second moment, so the curvature of the irradiance survives. It is mirrored
     at the rim, where the surface bends and light changes from cell to cell: those cells keep their values.
     """
-    return _along_both(_smoothing_matrix(irradiance.shape[-1], factor, _SMOOTHING_CELLS), irradiance)
-
-
-def _along_both(step: Array, irradiance: Array) -> Array:
-    return np.einsum("yi,...ij,xj->...yx", step, irradiance, step, optimize=["einsum_path", (0, 1), (0, 1)])
+    step = _smoothing_matrix(irradiance.shape[-1], factor, _SMOOTHING_CELLS).astype(irradiance.dtype)
+    return np.asarray(step @ irradiance @ step.T)
 
 
 @lru_cache(maxsize=8)

@@ -1,8 +1,7 @@
-"""Light's first pass through the tissue, on cells: what enters at an angle comes out ahead and spread.
+"""Light's passes through the tissue, on cells: what enters at an angle comes out ahead and spread.
 
 Each map of what enters (`irradiance.transmitted`) is spread by its own kernel (`aslant`), for all light that
-leaves and for what leaves towards the camera, which comes from deeper. What the face throws back is spread as
-Lambertian light is.
+leaves and for what leaves towards the camera, which comes from deeper; and so is what the face throws back.
 """
 
 from __future__ import annotations
@@ -14,9 +13,20 @@ import scipy.fft
 from numpy.typing import NDArray
 
 from .aslant import ALL, STEEP
-from .tissue import Coupling, TissueOptics
+from .tissue import Coupling
 
 Array = NDArray[np.float64]
+
+_PADDED = 1.5  # light that has come farther than half the face is left out
+
+
+@dataclass(frozen=True)
+class Face:
+    """What a face throws back of light that leaves with one function of the angle as light of another:
+    (i, j, cells, cells), of harmonic 0, and of harmonic 1."""
+
+    even: NDArray[np.float32]
+    turning: NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -56,98 +66,152 @@ class Passage:
     ----------
     entering, seen : (functions, p, p // 2 + 1)
         Fourier transforms of the kernels, over cells, padded so that nothing wraps round: of Lambertian light
-        that comes out as all that entered does, and of the light towards the camera. Their origin is shifted
-        from the guide's first cell to the margin's.
-    lambertian : (p, p // 2 + 1)
-        The same of Lambertian light, towards the camera.
+        that comes out as all that entered does, and of the light towards the camera.
+    shift : (p, p // 2 + 1)
+        Moves the origin from the guide's first cell to the margin's.
+    rings, turns
+        How many functions are of harmonic 0, and of harmonic 1 with the cosine.
     cells, margin
         Of the guide's face per side, and beside it.
-    held : (n_fraction, modes, modes), free : (modes, modes)
-        W of `tissue.Coupling`.
-    local : (modes,)
-        What a mode's light adds towards the camera where it entered; 0 for the first.
-    transport_per_mm, behind, behind_lambertian
+    thrown, free : by harmonic, (n_fraction, r, r) and (r, r)
+        Of `tissue.Coupling`.
+    transport_per_mm, behind
         Of `aslant.Aslant`.
     """
 
     entering: NDArray[np.complex64]
     seen: NDArray[np.complex64]
-    lambertian: NDArray[np.float32]
+    shift: NDArray[np.complex64]
+    rings: int
+    turns: int
     cells: int
     margin: int
-    held: Array
-    free: Array
-    local: Array
+    thrown: tuple[Array, ...]
+    free: tuple[Array, ...]
     transport_per_mm: float
     behind: Array
-    behind_lambertian: float
 
     def enter(self, maps: Array) -> tuple[Array, Glimpse]:
-        """From maps (n, functions, m, m) of what enters, W/mm²: Lambertian irradiance that would come out as it
-        does, (n, cells, cells) with the margin; and what of the first pass leaves along the normal."""
-        entering, glimpse = [], []
-        for one in maps:
+        """From maps (n, functions, m, m) of what enters, W/mm²: Lambertian irradiance that would come out as
+        it does, (n, cells, cells) with the margin; and what of the first pass leaves along the normal."""
+        entering, glimpse = self._nothing(len(maps))
+        for number, one in enumerate(maps):
             spectra = self._forth(one)
-            entering.append(self._back(np.einsum("kyx,kyx->yx", spectra, self.entering)))
-            glimpse.append(np.einsum("kyx,kyx->yx", spectra, self.seen))
-        rings = self.behind.size
-        behind = maps[:, :rings].sum(axis=(2, 3)) @ self.behind
-        return np.stack(entering), Glimpse(np.stack(glimpse), behind)
+            entering[number] = self._back(self.shift * _summed(spectra, self.entering))
+            glimpse.spectra[number] = self.shift * _summed(spectra, self.seen)
+            glimpse.behind[number] = self.behind @ one[: self.rings].sum(axis=(1, 2))
+        return entering, glimpse
 
-    def towards_camera(self, glimpse: Glimpse, upward: Array, fraction: Array) -> Seen:
-        """What leaves towards the camera.
+    def face(self, fraction: Array) -> Face:
+        """The face where the real contact fraction is (cells, cells), not a number where no guide is but bare
+        skin."""
+        bare = np.isnan(fraction)
+        nodes, known = np.linspace(0.0, 1.0, len(self.thrown[0])), np.where(bare, 0.0, fraction)
+
+        def at(harmonic: int) -> NDArray[np.float32]:
+            table, free = self.thrown[harmonic], self.free[harmonic]
+            found = np.empty((*free.shape, *fraction.shape), np.float32)
+            for i, j in np.ndindex(*free.shape):
+                found[i, j] = np.where(bare, free[i, j], np.interp(known, nodes, table[:, i, j]))
+            return found
+
+        return Face(at(0), 0.5 * at(1))
+
+    def thrown_back(self, upward: Array, face: Face, *, even: bool = False) -> tuple[Array, Glimpse]:
+        """What the face throws back, as `enter` has it, beyond what `spread` knows: that takes it for
+        Lambertian, but light that leaves aslant goes on in its direction when it is mirrored.
+
+        By reciprocity light that entered evenly leaves as light that comes out evenly has entered.
 
         Parameters
         ----------
-        glimpse
-            From `enter`.
         upward : (n, modes, cells, cells)
             V, from `spread`.
-        fraction : (cells, cells)
-            Real contact fraction; not a number where there is no guide but bare skin.
+        even
+            Leave out what turns with the azimuth.
         """
-        bare = np.isnan(fraction)
-        nodes, fraction = np.linspace(0.0, 1.0, len(self.held)), np.where(bare, 0.0, fraction)
-        modes = range(len(self.free))
-        thrown = np.zeros_like(upward)
-        for i in modes:
-            for j in modes:
-                held = np.where(bare, self.free[i, j], np.interp(fraction, nodes, self.held[:, i, j]))
-                thrown[:, i] += held * upward[:, j]
-        seen = np.tensordot(thrown, self.local, (1, 0))
-        for number, (spectrum, again) in enumerate(zip(glimpse.spectra, thrown[:, 0], strict=True)):
-            seen[number] += self._back(spectrum + self.lambertian * self._forth(again))
-        behind = glimpse.behind + self.behind_lambertian * thrown[:, 0].sum(axis=(1, 2))
-        behind /= np.maximum(seen.sum(axis=(1, 2)), 1e-300)
+        rings, light = slice(self.rings), upward.astype(np.float32)
+        halves = [] if even else [self.rings + half * self.turns + np.arange(self.turns) for half in (0, 1)]
+        entering, glimpse = self._nothing(len(light))
+        for number, fields in enumerate(light):
+            thrown = _weighed(face.even[:, : len(fields)], fields)
+            glimpse.behind[number] = self.behind @ thrown.sum(axis=(1, 2), dtype=np.float64)
+            spectra = self._forth(thrown)
+            found, seen = (
+                _summed(spectra, self.entering[rings]) - spectra[0],
+                _summed(spectra, self.seen[rings]),
+            )
+            source = self._forth(fields[0])
+            for half in halves:
+                aslant = self._back(source * self.entering[half])
+                spectra = self._forth(_weighed(face.turning, aslant))
+                found += _summed(spectra, self.entering[half])
+                seen += _summed(spectra, self.seen[half])
+            entering[number], glimpse.spectra[number] = self._back(found), seen
+        return entering, glimpse
+
+    def towards_camera(self, *glimpses: Glimpse) -> Seen:
+        """What leaves towards the camera, all passes together."""
+        seen, _ = self._nothing(len(glimpses[0].behind))
+        for number in range(len(seen)):
+            seen[number] = self._back(np.sum([one.spectra[number] for one in glimpses], axis=0))
+        behind = np.sum([one.behind for one in glimpses], axis=0) / np.maximum(seen.sum(axis=(1, 2)), 1e-300)
         return Seen(seen, behind, 1.0 - self.transport_per_mm * behind)
 
-    def _forth(self, maps: Array) -> NDArray[np.complex64]:
-        padded = len(self.lambertian)
-        rows = scipy.fft.rfft(maps.astype(np.float32), padded, axis=-1, workers=1)
-        return np.asarray(scipy.fft.fft(rows, padded, axis=-2, workers=1))
+    def _nothing(self, count: int) -> tuple[Array, Glimpse]:
+        """Room for so many LEDs' light."""
+        wide = self.cells + 2 * self.margin
+        spectra = np.zeros((count, *self.shift.shape), dtype=np.complex64)
+        return np.zeros((count, wide, wide)), Glimpse(spectra, np.zeros(count))
 
-    def _back(self, spectrum: NDArray[np.complex64]) -> Array:
-        padded, wide = len(self.lambertian), self.cells + 2 * self.margin
+    def _forth(self, maps: NDArray[np.floating]) -> NDArray[np.complex64]:
+        padded = len(self.shift)
+        rows = scipy.fft.rfft(maps.astype(np.float32, copy=False), padded, axis=-1, workers=1)
+        return np.asarray(scipy.fft.fft(rows, padded, axis=-2, workers=1, overwrite_x=True))
+
+    def _back(self, spectrum: NDArray[np.complex64]) -> NDArray[np.float32]:
+        padded, wide = len(self.shift), self.cells + 2 * self.margin
         rows = scipy.fft.ifft(spectrum, axis=-2, workers=1)[..., :wide, :]
-        return scipy.fft.irfft(rows, padded, axis=-1, workers=1)[..., :wide].astype(np.float64)
+        return np.asarray(scipy.fft.irfft(rows, padded, axis=-1, workers=1)[..., :wide])
 
 
-def passage(tissue: TissueOptics, coupling: Coupling, width_mm: float, cells: int, margin: int) -> Passage:
-    """Prepare the first pass on `cells` x `cells` cells over a face of `width_mm`, and a margin beside it."""
+def _weighed(weights: NDArray[np.float32], fields: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Σ_j weights (i, j, m, m) fields (j, m, m)."""
+    return np.stack([sum((w * f for w, f in zip(row, fields, strict=True))) for row in weights])
+
+
+def _summed(spectra: NDArray[np.complex64], kernels: NDArray[np.complex64]) -> NDArray[np.complex64]:
+    """Σ_k of products (k, p, q)."""
+    total = spectra[0] * kernels[0]
+    for one, kernel in zip(spectra[1:], kernels[1:], strict=True):
+        total += one * kernel
+    return total
+
+
+def passage(coupling: Coupling, width_mm: float, cells: int, margin: int) -> Passage:
+    """Prepare the passes on `cells` x `cells` cells over a face of `width_mm`, and a margin beside it."""
     apart, step = coupling.aslant, width_mm / cells
-    padded = int(scipy.fft.next_fast_len(2 * (cells + 2 * margin), real=True))
-    kx, ky = (2.0 * np.pi * turn(padded, step) for turn in (scipy.fft.rfftfreq, scipy.fft.fftfreq))
+    padded = int(scipy.fft.next_fast_len(int(_PADDED * (cells + 2 * margin)), real=True))
+    kx, ky = (2.0 * np.pi * waves(padded, step) for waves in (scipy.fft.rfftfreq, scipy.fft.fftfreq))
     k, azimuth = np.hypot(kx, ky[:, None]), np.arctan2(ky[:, None], kx)
-    shift = np.exp(-1j * margin * step * (kx + ky[:, None]))
+    shift = np.exp(-1j * margin * step * (kx + ky[:, None])).astype(np.complex64)
     kernels: tuple[list[NDArray[np.complex64]], ...] = ([], [])
     for m, transforms in enumerate(apart.transforms):
         for turn in (np.cos, np.sin) if m else (np.cos,):
             for what, tail in ((ALL, 0.0), (STEEP, 1.0)):
-                turned = turn(m * azimuth) * shift * (1j if m % 2 else 1.0)
-                found = apart.at(transforms[what], k, tail) * turned
+                found = apart.at(transforms[what], k, tail) * turn(m * azimuth) * (1j if m % 2 else 1.0)
                 kernels[what].extend(found.astype(np.complex64))
-    lambertian = apart.at(apart.lambertian, k, 1.0).astype(np.float32)
-    local = tissue.strengths * tissue.lobes[:, -1] * (np.arange(tissue.strengths.size) > 0)
     entering, seen = (np.array(one, dtype=np.complex64) for one in kernels)
-    of_exit = apart.transport_per_mm, apart.behind, apart.behind_lambertian
-    return Passage(entering, seen, lambertian, cells, margin, coupling.held, coupling.free, local, *of_exit)
+    return Passage(
+        entering,
+        seen,
+        shift,
+        len(apart.functions[0]),
+        len(apart.functions[1]),
+        cells,
+        margin,
+        thrown=coupling.thrown,
+        free=coupling.thrown_free,
+        transport_per_mm=apart.transport_per_mm,
+        behind=apart.behind,
+    )

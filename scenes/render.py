@@ -98,7 +98,7 @@ class Renderer:
             coupling = build.coupling_of(sensor, optics)
             _, body = tissue.body_behind(sensor.skin, sensor.tissue)
             cells, margin, width = transport.GRID, transport.MARGIN, sensor.guide.width_mm
-            first = passage.passage(body, coupling, width, cells, margin)
+            first = passage.passage(coupling, width, cells, margin)
             wide = cells + 2 * margin
             spreads = spread.spreader(body, coupling, width * wide / cells, wide)
             self.basis = angular_basis(optics, coupling)

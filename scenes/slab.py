@@ -126,7 +126,7 @@ class Slab:
         return rate[0], unit * falling[0, :, 0], unit * rising[0, :, 0]
 
     def _steep_field(self, k: Array) -> tuple[Array, Array, Array]:
-        """The same of the radiance factor along the normal: C exp(-z), and modes that undo it at the faces."""
+        """The same of the radiance factor along the normal: C exp(-z), and modes that undo it at faces."""
         mu, weight = cosines()
         q, rate, vectors = self._rates(k)
         normal = 1.0 + 1e-7  # off the pole where a mode falls as fast
@@ -151,9 +151,10 @@ class Slab:
             return (falling / (rate + p)).sum(axis=-1)
         near = falling * -np.expm1(-(rate + p) * self.depth) / (rate + p)
         # ∫ exp(-p z) exp(-λ (d - z)) dz, safe where λ = p
-        apart = p - rate
-        later = np.exp(-np.where(apart.real > 0.0, rate, p) * self.depth)
-        apart = np.where(apart.real > 0.0, apart, -apart) * self.depth
+        apart: NDArray[np.inexact] = p - rate
+        falls = apart.real > 0.0
+        later = np.exp(-np.where(falls, rate, p) * self.depth)
+        apart = (2.0 * falls - 1.0) * apart * self.depth
         small = np.abs(apart) < 1e-8
         ratio = np.where(small, 1.0, -np.expm1(-apart) / np.where(small, 1.0, apart))
         return (near + rising * self.depth * later * ratio).sum(axis=-1)

@@ -106,7 +106,10 @@ class Coupling:
     aslant
         How light that enters aslant comes out.
     ways : by harmonic m of the azimuth, (r_m, n_cos)
-        `Aslant.functions` on the cosines in the guide.
+        `Aslant.functions` h on the cosines in the guide.
+    thrown, thrown_free : by harmonic, (n_fraction, r_m, r_m) and (r_m, r_m)
+        ⟨h_i h_j (1 - T)⟩ of them: what the face throws back, and bare skin; `held`, `free` are part of the
+        first.
     """
 
     lobes: Array
@@ -116,6 +119,8 @@ class Coupling:
     free: Array
     aslant: Aslant
     ways: tuple[Array, ...]
+    thrown: tuple[Array, ...]
+    thrown_free: tuple[Array, ...]
 
 
 def tissue_optics(
@@ -179,34 +184,39 @@ def couple(optics: ContactOptics, tissue: TissueOptics, n_guide: float, n_tissue
     cosine = np.linspace(0.0, 1.0, optics.transmittance.shape[1])
     scale = (n_guide / n_tissue) ** 2
     inside = 1.0 - scale * (1.0 - cosine**2)  # squared cosine in the tissue
-    lobes = np.where(inside > 0.0, tissue.lobe(np.sqrt(np.maximum(inside, 0.0))), 0.0)
-    mu, weight = cosines()
-    there = tissue.lobe(mu)
-    overlap = np.einsum("m,im,jm->ij", 2.0 * mu * weight, there, there)
-    moments = 2.0 * moment_weights(cosine)
-    passed = np.einsum("m,im,jm,am->aij", moments, lobes, lobes, optics.transmittance, optimize=True)
-    held = overlap - scale * passed
-    free = overlap - _passed_by_bare_skin(tissue, n_tissue)
-    apart = aslant(tissue.slab, tissue.transport_per_mm, tissue.lobes)
     there, grid = np.sqrt(np.maximum(inside, 0.0)), np.linspace(0.0, 1.0, _COSINES)
-    ways = tuple(
-        np.array([np.interp(there, grid, one) for one in several]).reshape(-1, cosine.size) * (inside > 0.0)
-        for several in apart.functions
-    )
+    apart = aslant(tissue.slab, tissue.transport_per_mm, tissue.lobes)
+    mu, weight = cosines()
+    moments, critical = 2.0 * moment_weights(cosine), _passed_by_bare_skin(n_tissue)
+    ways, thrown, free = [], [], []
+    for functions in apart.functions:
+        several = np.array([np.interp(there, grid, one) for one in functions]).reshape(-1, cosine.size)
+        several *= inside > 0.0
+        inner, bare = (
+            np.array([np.interp(at, grid, one) for one in functions]).reshape(-1, at.size)
+            for at in (mu, critical[0])
+        )
+        overlap = np.einsum("m,im,jm->ij", 2.0 * mu * weight, inner, inner)
+        passed = np.einsum("m,im,jm,am->aij", moments, several, several, optics.transmittance, optimize=True)
+        ways.append(several)
+        thrown.append(overlap - scale * passed)
+        free.append(overlap - np.einsum("m,im,jm->ij", critical[1], bare, bare))
+    modes = slice(len(tissue.lobes))
+    held = thrown[0][:, modes, modes]
     gain = scale * _resummed(tissue.strengths, held)
-    return Coupling(lobes, held, gain, scale, free, apart, ways)
+    of_ways = tuple(ways), tuple(thrown), tuple(free)
+    return Coupling(ways[0][modes], held, gain, scale, free[0][modes, modes], apart, *of_ways)
 
 
-def _passed_by_bare_skin(tissue: TissueOptics, n_tissue: float) -> Array:
-    """⟨φ_i φ_j T⟩ of a face to air, (modes, modes); T starts at the critical angle."""
+def _passed_by_bare_skin(n_tissue: float) -> tuple[Array, Array]:
+    """Cosines, and weights of ∫ f T 2µ dµ, of a face to air; T starts at the critical angle."""
     critical = np.sqrt(1.0 - 1.0 / n_tissue**2)
     x, w = np.polynomial.legendre.leggauss(200)
     inner = 0.5 * (1.0 + x)
     cosine = critical + (1.0 - critical) * inner**2  # T rises as a square root
     weight = 2.0 * cosine * (1.0 - critical) * inner * w
     t_s, t_p = gap_transmittance(n_tissue, 1.0, 1.0, 0.0, cosine, 550.0)  # no gap: any wavelength will do
-    lobes = tissue.lobe(cosine)
-    return np.asarray(np.einsum("m,im,jm->ij", weight * 0.5 * (t_s + t_p), lobes, lobes))
+    return cosine, np.asarray(weight * 0.5 * (t_s + t_p))
 
 
 def _resummed(strengths: Array, held: Array) -> Array:

@@ -22,9 +22,10 @@ from .spread import Spread
 from .tissue import Coupling
 
 Array = NDArray[np.float64]
+Singles = NDArray[np.float32]
 
 GRID = 200  # cells of the maps per side
-MARGIN = 20  # cells beside them, in which light comes out of bare skin
+MARGIN = 30  # cells beside them, in which light comes out of bare skin
 INSIDE = slice(MARGIN, MARGIN + GRID)
 _ORDERS = 12  # of re-emission at most
 _ENOUGH = 3e-3  # share of the light below which the orders to come are estimated
@@ -124,7 +125,7 @@ def transport(
     flux = np.array([led.flux_W for led in sensor.leds])
     starts = np.random.Generator(np.random.Philox(seed)).integers(0, 2**32, size=(_ORDERS + 1, 4))
 
-    def walk(order: int, each: int, upward: Array | None) -> tuple[Array, Array, Array, Array]:
+    def walk(order: int, each: int, upward: Array | None) -> tuple[Singles, Array, Array, Array]:
         index = dr.arange(mi.UInt32, n_led * each)
         number = index // mi.UInt32(dr.opaque(mi.UInt32, each))
         u = trace.evenly(trace.side_by_side(each, n_led), starts[order])
@@ -140,15 +141,16 @@ def transport(
         begun = np.asarray(amount, dtype=np.float64).reshape(n_led, each).mean(axis=1)
         found = trace.walk(scene, sensor, table, basis, number, ray, amount, leg, 16 * seed + order)
         area = (sensor.guide.width_mm / trace.CELLS) ** 2
-        maps = found.maps * (scale / each / area)[:, None, None, None]
+        maps = (found.maps * (scale / each / area)[:, None, None, None]).astype(np.float32)
         sinks, trapped = found.sinks * (scale / each)[:, None], found.trapped * scale / each
         return maps, sinks, trapped, begun * scale
 
     each = max(samples // 2, 1)
     maps, sinks, trapped, _ = walk(0, each, None)
     traced = smooth(maps, GRID // trace.CELLS)
-    landed = straight + traced
-    newest = under.seen(landed)[0]
+    gathered: Singles = straight.astype(np.float32)
+    landed = gathered + traced
+    newest = under.upward(landed)
     total = newest[:, 0].sum(axis=(1, 2))
     ratio = np.ones(n_led)
     for order in range(1, _ORDERS + 1):
@@ -164,8 +166,8 @@ def transport(
         total, traced = total + before * ratio, traced + landed
     # each order is like the one before by now: the rest is a geometric series
     ratio = np.clip(ratio, 0.0, 0.9)
-    traced = traced + landed * (ratio / (1.0 - ratio))[:, None, None, None]
-    return Light(*under.seen(straight + traced), sinks, trapped, traced)
+    traced = traced + landed * (ratio / (1.0 - ratio)).astype(np.float32)[:, None, None, None]
+    return Light(*under.seen(gathered + traced), sinks, trapped, traced.astype(np.float64))
 
 
 def again(
@@ -194,19 +196,34 @@ class _Under:
     behind: Behind
     ground: Ground
 
-    def again(self, landed: Array) -> Array:
-        """Light that goes up in the tissue, (n_led, modes, GRID, GRID), as if it came out where it went in but
-        for its spread: enough for light that has been in the tissue before."""
+    def again(self, landed: NDArray[np.floating]) -> Array:
+        """Light that goes up in the tissue, (n_led, modes, GRID, GRID), as if it had entered evenly from all
+        sides: enough for light that has been in the tissue before."""
         return self._upward(transmitted(self.entrance, landed * self.ground.meets, self._modes), 1e-4)[0]
 
-    def seen(self, landed: Array) -> tuple[Array, Seen]:
+    def upward(self, landed: NDArray[np.floating]) -> Array:
+        """The same, ahead of where it went in."""
+        entering = transmitted(self.entrance, landed * self.ground.meets)
+        straight, _ = self.behind.passage.enter(entering)
+        return self._upward(entering[:, : self._modes], 1e-4, straight)[0]
+
+    def seen(self, landed: NDArray[np.floating]) -> tuple[Array, Seen]:
         """`Light.upward` and `Light.seen` of weighted irradiance (n_led, layers, GRID, GRID)."""
         entering = transmitted(self.entrance, landed * self.ground.meets)
-        straight, glimpse = self.behind.passage.enter(entering)
+        passage = self.behind.passage
+        straight, glimpse = passage.enter(entering)
         inside, upward = self._upward(entering[:, : self._modes], 1e-6, straight)
-        return inside, self.behind.passage.towards_camera(glimpse, upward, self._fraction)
+        face = passage.face(self._fraction)
+        further, again = passage.thrown_back(upward, face)
+        more = np.zeros_like(upward)
+        more[:, 0] = further
+        more = self.behind.spread.solve(more, self._fraction, 1e-3)
+        _, last = passage.thrown_back(more, face, even=True)
+        return inside + more[..., INSIDE, INSIDE], passage.towards_camera(glimpse, again, last)
 
-    def _upward(self, entering: Array, tolerance: float, straight: Array | None = None) -> tuple[Array, Array]:
+    def _upward(
+        self, entering: Array, tolerance: float, straight: Array | None = None
+    ) -> tuple[Array, Array]:
         """V without the margin, and with it."""
         wide = np.pad(entering, ((0, 0), (0, 0), (MARGIN, MARGIN), (MARGIN, MARGIN)))
         if straight is not None:

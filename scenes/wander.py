@@ -27,10 +27,11 @@ _LEAST = 1e-6  # of a chance that is divided by: what is rarer never happens
 class View(Protocol):
     """What collects light that leaves towards it.
 
-    Its rays spread by `spread_per_mm` of their slope for each mm aside: what lies deeper is seen from farther.
+    Its rays' slope grows by `spread_per_mm` for each mm aside: what lies deeper is seen from farther.
     """
 
-    spread_per_mm: float
+    @property
+    def spread_per_mm(self) -> float: ...
 
     def towards(self, point: mi.Point3f) -> mi.Vector3f:
         """Direction, down, from a point to the viewer, with z = -1."""

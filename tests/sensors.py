@@ -12,6 +12,7 @@ import pyvista as pv
 from scenes.contact import ContactOptics, contact_optics
 from scenes.sensor import Camera, Glass, Guide, Led, Sensor, Side
 from scenes.skin import Skin, Tissue
+from scenes.surface import NODES, OpticalSurface
 
 HALF_MM = 12.5
 ALBEDO = 0.68
@@ -65,6 +66,17 @@ def bump() -> pv.PolyData:
         lambda x, y: (0.05 * x / HALF_MM, 0.05 * y / HALF_MM, -0.05 - 0.02 * rise(x, y)),
         cells=100,
     )
+
+
+def domed() -> OpticalSurface:
+    """The same on a dome of 150 mm radius, pressed flat in the middle and off at the corners."""
+    line = np.linspace(-HALF_MM, HALF_MM, NODES)
+    square = line**2 + line[:, None] ** 2
+    rest, rise = -square / 300.0, np.exp(-square / 32.0)
+    height = -0.25 - 0.02 * rise - np.maximum(square - 64.0, 0.0) / 400.0
+    displacement = np.stack([0.0 * rest, 0.0 * rest, height - rest], axis=-1)
+    pressure = 0.9 * (1.0 + 0.6 * rise) * np.clip(1.0 - square / 200.0, 0.0, None) ** 0.5
+    return OpticalSurface(line, displacement, pressure, rest)
 
 
 @cache

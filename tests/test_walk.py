@@ -2,7 +2,6 @@
 
 import dataclasses
 from types import ModuleType
-from typing import Any
 
 import numpy as np
 import pytest
@@ -281,7 +280,9 @@ def test_light_that_enters_aslant_comes_out_ahead(steps: ModuleType, variant: st
     zero = 0.0 * random.next_float32()
     way = mi.Vector3f(float(np.sqrt(1.0 - cosine**2)) + zero, zero, cosine + zero)
     body = steps.Body(steps.Medium(1.0, 0.02))
-    place, out, weight, _, _, _ = steps.roam(body, 0.0 * mi.Point3f(way), way, random, steps.fresnel(1.0, 1.0))
+    place, out, weight, _, _, _ = steps.roam(
+        body, 0.0 * mi.Point3f(way), way, random, steps.fresnel(1.0, 1.0)
+    )
     x, y, up, share = (np.asarray(v, dtype=np.float64) for v in (place.x, place.y, out.z, weight))
     values = np.stack([x, x**2 - y**2, x**2 + y**2])
 
