@@ -131,7 +131,8 @@ class Passage:
             Leave out what turns with the azimuth.
         """
         rings, light = slice(self.rings), upward.astype(np.float32)
-        halves = [] if even else [self.rings + half * self.turns + np.arange(self.turns) for half in (0, 1)]
+        turning = self.turns > 0 and not even
+        halves = [self.rings + half * self.turns + np.arange(self.turns) for half in (0, 1) if turning]
         entering, glimpse = self._nothing(len(light))
         for number, fields in enumerate(light):
             thrown = _weighed(face.even[:, : len(fields)], fields)
@@ -141,9 +142,8 @@ class Passage:
                 _summed(spectra, self.entering[rings]) - spectra[0],
                 _summed(spectra, self.seen[rings]),
             )
-            source = self._forth(fields[0])
             for half in halves:
-                aslant = self._back(source * self.entering[half])
+                aslant = self._back(self._forth(fields[0]) * self.entering[half])
                 spectra = self._forth(_weighed(face.turning, aslant))
                 found += _summed(spectra, self.entering[half])
                 seen += _summed(spectra, self.seen[half])
