@@ -191,9 +191,9 @@ def _fresnel(n_in: float, n_out: float, square: mi.Float) -> mi.Float:
     return dr.select(square < n_out**2, 0.5 * (dr.square(s) + dr.square(p)), 1.0)
 
 
-def picture(sight: Sight, seen: Seen, margin: int) -> NDArray[np.float32]:
+def picture(sight: Sight, seen: Seen, margin: int, *, lamps: bool = True) -> NDArray[np.float32]:
     """Radiance in air at the pixels, (n_led, rows, columns), in W m⁻² sr⁻¹; so many cells of what is seen lie
-    beside the guide's face on each side.
+    beside the guide's face on each side. Without the LEDs in sight if not `lamps`.
     """
     n_led, cells = len(seen.maps), seen.maps.shape[-1]
     inside = 1.0 - 2.0 * margin / cells
@@ -210,4 +210,4 @@ def picture(sight: Sight, seen: Seen, margin: int) -> NDArray[np.float32]:
     dr.eval(total)
     shape = (n_led, *sight.position_mm.shape[:2])
     found = np.stack([np.asarray(layer) for layer in total]).reshape(shape)
-    return np.asarray((found + sight.lamps) * np.float32(1e6))
+    return np.asarray((found + sight.lamps if lamps else found) * np.float32(1e6))

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
     from .gather import Sight
     from .traced import TracedLight
-    from .transport import Light
 
 Array = NDArray[np.float64]
 Quality = Literal["preview", "standard", "reference"]
@@ -159,29 +158,23 @@ class Renderer:
         build.put_surface(self.scene, self.sensor, shape)
         sight = gather.look(self.scene, self.sensor, self.table, self.behind.coupling, self.rays)
         samples = samples or PATHS_PER_LED[quality]
-        each = max(_PATHS_PER_PASS // len(self.sensor.leds), 1)
-        passes = max(_LEAST_PASSES, -(-samples // each))
-        lights: list[Light] = []
-        walked: list[Array] = []
-        if traced is not None:
-            self.check_leds(shape)
-            pictures, passes, noise = self._again(shape, sight, traced[0], walked), 1, None
-        elif quality == "reference":
-            pictures = self._followed(sight, -(-samples // passes), seed)
+        passes = max(_LEAST_PASSES, -(-samples // max(_PATHS_PER_PASS // len(self.sensor.leds), 1)))
+        each, effort = max(-(-samples // passes), 2), _Effort(passes, noise, progress or (lambda done: None))
+        if quality == "reference" and traced is None:
+            found = self._followed(sight, each, seed, effort)
         else:
             self.check_leds(shape)
-            pictures = self._gathered(shape, sight, max(samples // passes, 2), seed, lights)
-        radiance, found = _averaged(pictures, passes, noise, progress or (lambda done: None))
+            found = self._gathered(shape, sight, each, seed, effort, None if traced is None else traced[0])
         return Rendering(
             # the smoothing kernel has negative sides: next to an edge of light they may undershoot the dark
-            np.maximum(radiance, 0.0).astype(np.float32),
+            np.maximum(found.radiance, 0.0).astype(np.float32),
             sight.position_mm,
             shape,
-            found,
+            found.noise_percent,
             time.perf_counter() - start,
-            np.mean([light.sinks for light in lights], axis=0) if lights else None,
-            np.mean([light.trapped for light in lights], axis=0) if lights else None,
-            (np.mean([light.traced for light in lights], axis=0),) if lights else tuple(walked) or None,
+            found.sinks,
+            found.trapped,
+            None if found.traced is None else (found.traced,),
         )
 
     def check_leds(self, shape: surface.OpticalSurface) -> None:
@@ -195,66 +188,101 @@ class Renderer:
                 raise NotModelled(f"leds.{number}.z_mm: received {led.z_mm:g}; allowed {allowed}")
 
     def _gathered(
-        self, shape: surface.OpticalSurface, sight: Sight, samples: int, seed: int, lights: list[Light]
-    ) -> Iterator[NDArray[np.floating]]:
-        """Pictures (n_led, rows, columns) of independent passes; `lights` takes what each found."""
+        self,
+        shape: surface.OpticalSurface,
+        sight: Sight,
+        samples: int,
+        seed: int,
+        effort: _Effort,
+        known: Array | TracedLight | None,
+    ) -> _Found:
+        """Gathered light, and traced light from independent passes, or as it is `known`."""
         from . import direct, gather, transport
 
-        straight = direct.direct(self.sensor, self.basis, shape)
+        straight = direct.direct(self.sensor, self.basis, shape).astype(np.float32)
         ground = transport.survey(self.scene, self.sensor)
-        parts = (self.scene, self.sensor, self.table, self.basis, self.behind, ground, straight, samples)
-        for number in range(_MOST_PASSES):
-            with threadpool_limits(1):
-                light = transport.transport(*parts, seed * _MOST_PASSES + number)
-            lights.append(light)
-            yield gather.picture(sight, light.seen, transport.MARGIN)
-
-    def _again(
-        self, shape: surface.OpticalSurface, sight: Sight, traced: Array | TracedLight, walked: list[Array]
-    ) -> Iterator[NDArray[np.floating]]:
-        """The one picture (n_led, rows, columns) with light that was traced before; `walked` takes it."""
-        from . import direct, gather, transport
-
-        straight = direct.direct(self.sensor, self.basis, shape)
-        ground = transport.survey(self.scene, self.sensor)
+        sums: list[Any] = []
         with threadpool_limits(1):
-            light = (
-                traced if isinstance(traced, np.ndarray) else traced.at(self.sensor, shape, ground.fraction)
-            )
-            seen = transport.again(self.sensor, self.basis, self.behind, ground, straight, light)
-        walked.append(light)
-        yield gather.picture(sight, seen, transport.MARGIN)
+            under = transport.Under.at(self.basis, self.behind, ground)
+            lit = under.upward(straight) if known is None else None
+        parts = (self.scene, self.sensor, self.table, under, straight, samples)
 
-    def _followed(self, sight: Sight, samples: int, seed: int) -> Iterator[NDArray[np.floating]]:
-        """Pictures (n_led, rows, columns) of independent passes."""
+        def glances() -> Iterator[NDArray[np.floating]]:
+            for number in range(_MOST_PASSES):
+                with threadpool_limits(1):
+                    light = transport.transport(*parts, seed * _MOST_PASSES + number, lit)
+                    seen = under.glanced(light.upward)
+                found = (light.traced, light.sinks, light.trapped)
+                sums[:] = found if number == 0 else [a + b for a, b in zip(sums, found, strict=True)]
+                yield gather.picture(sight, seen, transport.MARGIN, lamps=False)[0]
+
+        if known is None:
+            count, noise = effort.spend(glances())
+            traced, sinks, trapped = (total / count for total in sums)
+        elif isinstance(known, np.ndarray):
+            noise, traced, sinks, trapped = 0.0, known, None, None
+        else:
+            found = known.at(self.sensor, shape, ground.fraction)
+            noise, traced, sinks, trapped = 0.0, found, None, None
+        with threadpool_limits(1):
+            seen = under.seen(straight + traced.astype(np.float32))
+        effort.tell(1.0)
+        return _Found(gather.picture(sight, seen, transport.MARGIN), noise, sinks, trapped, traced)
+
+    def _followed(self, sight: Sight, samples: int, seed: int, effort: _Effort) -> _Found:
+        """Every ray followed, in independent passes."""
         from . import exact, transport
 
         fraction = transport.survey(self.scene, self.sensor).fraction
         parts = (self.scene, self.sensor, self.table, self.rays, fraction, samples)
-        for number in range(_MOST_PASSES):
-            seen = exact.exact(*parts, seed * _MOST_PASSES + number)
-            yield 1e6 * (np.einsum("snyx,syx->nyx", seen, sight.windows) + sight.lamps)
+        total: Array | float = 0.0
+
+        def passes() -> Iterator[Array]:
+            nonlocal total
+            for number in range(_MOST_PASSES):
+                seen = exact.exact(*parts, seed * _MOST_PASSES + number)
+                layers = 1e6 * (np.einsum("snyx,syx->nyx", seen, sight.windows) + sight.lamps)
+                total = total + layers
+                yield layers.sum(axis=0)
+
+        count, noise = effort.spend(passes())
+        return _Found(np.asarray(total) / count, noise)
 
 
-def _averaged(
-    pictures: Iterator[NDArray[np.floating]], passes: int, noise: float | None, tell: Callable[[float], None]
-) -> tuple[Array, float]:
-    """Mean of so many pictures, or as many as the noise asks for, and the noise of the mean in per cent."""
-    total: Array | float = 0.0
-    whole: Array | float = 0.0
-    squares: Array | float = 0.0
-    for number, picture in enumerate(pictures, start=1):
-        layers = np.asarray(picture, dtype=np.float64)
-        bright = layers.sum(axis=0)
-        total, whole, squares = total + layers, whole + bright, squares + bright**2
-        if passes == 1:
-            return total, 0.0
-        if number < min(passes, _LEAST_PASSES):
-            continue
-        variance = np.maximum(squares - whole**2 / number, 0.0) / max(number - 1, 1) / number
-        found = float(100.0 * np.sqrt(variance.mean()) / max(np.mean(whole) / number, 1e-30))
-        left = passes - number if noise is None else int(np.ceil(number * ((found / noise) ** 2 - 1.0)))
-        tell(number / (number + max(left, 0)))
-        if left <= 0:
-            break
-    return np.asarray(total / number), found
+@dataclass(frozen=True)
+class _Found:
+    """What is in a `Rendering`."""
+
+    radiance: NDArray[np.floating]
+    noise_percent: float
+    sinks: Array | None = None
+    trapped: Array | None = None
+    traced: Array | None = None
+
+
+@dataclass(frozen=True)
+class _Effort:
+    """So many passes, or as many as the noise asks for, per cent; `tell` hears the finished share."""
+
+    passes: int
+    noise: float | None
+    tell: Callable[[float], None]
+
+    def spend(self, pictures: Iterator[NDArray[np.floating]]) -> tuple[int, float]:
+        """Number of pictures (rows, columns) that were taken, and the noise of their mean in per cent."""
+        whole: Array | float = 0.0
+        squares: Array | float = 0.0
+        for number, picture in enumerate(pictures, start=1):
+            bright = np.asarray(picture, dtype=np.float64)
+            whole, squares = whole + bright, squares + bright**2
+            if number < min(self.passes, _LEAST_PASSES):
+                continue
+            variance = np.maximum(squares - whole**2 / number, 0.0) / max(number - 1, 1) / number
+            found = float(100.0 * np.sqrt(variance.mean()) / max(np.mean(whole) / number, 1e-30))
+            left = self.passes - number
+            if self.noise is not None:
+                left = int(np.ceil(number * ((found / self.noise) ** 2 - 1.0)))
+            self.tell(number / (number + max(left, 0)))
+            if left <= 0:
+                break
+        return number, found

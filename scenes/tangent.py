@@ -76,10 +76,11 @@ def traced(
     ground = transport.survey(renderer.scene, renderer.sensor)
     sensor, basis, behind = renderer.sensor, renderer.basis, renderer.behind
     light = straight.on(direct.relief(sensor, shape))
-    parts = (renderer.scene, sensor, renderer.table, basis, behind, ground, light)
+    under = transport.Under.at(basis, behind, ground)
+    parts = (renderer.scene, sensor, renderer.table, under, light.astype(np.float32))
     with threadpool_limits(1):
         found = transport.transport(*parts, samples or PATHS_PER_LED[quality], seed)
-    return found.traced
+    return found.traced.astype(np.float64)
 
 
 def picture(renderer: Renderer, shape: OpticalSurface, straight: Straight, traced: Array) -> Array:
@@ -91,5 +92,5 @@ def picture(renderer: Renderer, shape: OpticalSurface, straight: Straight, trace
     ground = transport.survey(renderer.scene, sensor)
     light = straight.on(direct.relief(sensor, shape))
     with threadpool_limits(1):
-        seen = transport.again(sensor, basis, behind, ground, light, traced)
+        seen = transport.Under.at(basis, behind, ground).seen(light + traced)
     return np.asarray(gather.picture(sight, seen, transport.MARGIN), np.float64)

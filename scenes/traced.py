@@ -29,7 +29,9 @@ _MODES = 10
 _COARSE = 50  # cells per side on which modes are kept
 _FINE = 100  # on which their mean is
 _BEYOND = 2.0  # how far inputs may leave what was learned, times its reach
-FORMAT = "tsis-traced-1"
+FORMAT = "tsis-traced-2"
+LIGHT = 2
+"""Counts up when pictures of the same press change: what was learned or kept before is of no use then."""
 ARRAYS = ("centre", "axes", "reach", "weights", "mean", "modes")
 """Fields of `TracedLight` that are arrays."""
 
@@ -74,7 +76,10 @@ class TracedLight:
             For another sensor, and for presses far from those that were learned.
         """
         if optics_key(sensor) != self.key:
-            raise NotModelled("traced: received light learned of another sensor; allowed this sensor's own")
+            raise NotModelled(
+                "traced: received light learned of another sensor or by an earlier version; allowed this "
+                "sensor's own"
+            )
         inputs = (describe(shape, fraction) - self.centre) @ self.axes
         far = float(np.max(np.abs(inputs) / self.reach))
         if far > _BEYOND:
@@ -93,7 +98,7 @@ def optics_key(sensor: Sensor) -> str:
     and what the contact fraction says."""
     leds = tuple(replace(led, flux_W=1.0) for led in sensor.leds)
     skin = replace(sensor.skin, rms_slope=1.0, kappa=1.0)
-    told = (sensor.guide, sensor.glass, leds, skin, sensor.tissue, sensor.wavelength_nm)
+    told = (LIGHT, sensor.guide, sensor.glass, leds, skin, sensor.tissue, sensor.wavelength_nm)
     return hashlib.sha256(repr(told).encode()).hexdigest()[:16]
 
 
@@ -101,8 +106,8 @@ def check(light: Sequence[TracedLight], sensors: Sequence[Sensor]) -> None:
     """Raise `NotModelled` if light was not learned of these sensors, one for each band."""
     if [one.key for one in light] != [optics_key(sensor) for sensor in sensors]:
         raise NotModelled(
-            "traced: received light learned of another sensor; allowed this one's (LED power, camera and "
-            "rms_slope are free)"
+            "traced: received light learned of another sensor or by an earlier version; allowed this one's "
+            "(LED power, camera and rms_slope are free)"
         )
 
 

@@ -64,21 +64,18 @@ class Light:
     ----------
     upward : (n_led, modes, GRID, GRID)
         Light that goes up inside the tissue towards the contact surface, V_i of `tissue`, W/mm².
-    seen
-        What of it goes to the camera, with the margin.
     sinks : (n_led, len(trace.SINKS))
         W that end there; "tissue" is what the tissue keeps.
     trapped : (n_led,)
         W that come to the contact surface for the first time beyond the critical angle.
-    traced : (n_led, layers, GRID, GRID)
+    traced : (n_led, layers, GRID, GRID), single precision
         Weighted irradiance of all light that was not gathered, W/mm², all orders together.
     """
 
     upward: Array
-    seen: Seen
     sinks: Array
     trapped: Array
-    traced: Array
+    traced: Singles
 
 
 def survey(scene: mi.Scene, sensor: Sensor) -> Ground:
@@ -99,12 +96,11 @@ def transport(
     scene: mi.Scene,
     sensor: Sensor,
     table: Table,
-    basis: AngularBasis,
-    behind: Behind,
-    ground: Ground,
-    straight: Array,
+    under: Under,
+    straight: Singles,
     samples: int,
     seed: int,
+    lit: Array | None = None,
 ) -> Light:
     """Follow the LEDs' light until it has ended.
 
@@ -119,9 +115,11 @@ def transport(
         Light paths per LED, more than half of them from the LED itself.
     seed
         Seed of every random choice; the result depends on nothing else, not even on the number of threads.
+    lit
+        `Under.upward` of the gathered light, if it is known.
     """
     n_led = len(sensor.leds)
-    under = _Under(Entrance.at(basis, ground.fraction), behind, ground)
+    basis, behind = under.entrance.basis, under.behind
     flux = np.array([led.flux_W for led in sensor.leds])
     starts = np.random.Generator(np.random.Philox(seed)).integers(0, 2**32, size=(_ORDERS + 1, 4))
 
@@ -148,37 +146,24 @@ def transport(
     each = max(samples // 2, 1)
     maps, sinks, trapped, _ = walk(0, each, None)
     traced = smooth(maps, GRID // trace.CELLS)
-    gathered: Singles = straight.astype(np.float32)
-    landed = gathered + traced
-    newest = under.upward(landed)
-    total = newest[:, 0].sum(axis=(1, 2))
+    landed = traced
+    total = newest = under.again(traced) + (under.upward(straight) if lit is None else lit)
     ratio = np.ones(n_led)
     for order in range(1, _ORDERS + 1):
         before = newest[:, 0].sum(axis=(1, 2))
-        if (before * ratio).sum() <= _ENOUGH * total.sum():
+        if (before * ratio).sum() <= _ENOUGH * total[:, 0].sum():
             break
         maps, more, _, begun = walk(order, max(each >> min(2 * order, 6), 2), newest)
         sinks = sinks + more
         sinks[:, 0] -= begun
         landed = smooth(maps, GRID // trace.CELLS)
         newest = under.again(landed)
+        total, traced = total + newest, traced + landed
         ratio = newest[:, 0].sum(axis=(1, 2)) / np.maximum(before, 1e-300)
-        total, traced = total + before * ratio, traced + landed
     # each order is like the one before by now: the rest is a geometric series
     ratio = np.clip(ratio, 0.0, 0.9)
-    traced = traced + landed * (ratio / (1.0 - ratio)).astype(np.float32)[:, None, None, None]
-    return Light(*under.seen(gathered + traced), sinks, trapped, traced.astype(np.float64))
-
-
-def again(
-    sensor: Sensor, basis: AngularBasis, behind: Behind, ground: Ground, straight: Array, traced: Array
-) -> Seen:
-    """Light towards the camera, `Light.seen`, with the `traced` light of another press.
-
-    What an inclusion changes in it is small: light that has walked far through the guide tells of the whole
-    press, and is 5 % of what enters the contact where LEDs shine in from air.
-    """
-    return _Under(Entrance.at(basis, ground.fraction), behind, ground).seen(straight + traced)[1]
+    rest = (ratio / (1.0 - ratio))[:, None, None, None]
+    return Light(total + newest * rest, sinks, trapped, traced + landed * rest.astype(np.float32))
 
 
 def _first_leg(led: Led) -> int:
@@ -189,37 +174,55 @@ def _first_leg(led: Led) -> int:
 
 
 @dataclass(frozen=True)
-class _Under:
-    """The tissue under one contact."""
+class Under:
+    """The tissue under one contact.
+
+    What has `landed` is weighted irradiance (n_led, layers, GRID, GRID), W/mm².
+    """
 
     entrance: Entrance
     behind: Behind
     ground: Ground
 
+    @staticmethod
+    def at(basis: AngularBasis, behind: Behind, ground: Ground) -> Under:
+        return Under(Entrance.at(basis, ground.fraction), behind, ground)
+
     def again(self, landed: NDArray[np.floating]) -> Array:
         """Light that goes up in the tissue, (n_led, modes, GRID, GRID), as if it had entered evenly from all
         sides: enough for light that has been in the tissue before."""
-        return self._upward(transmitted(self.entrance, landed * self.ground.meets, self._modes), 1e-4)[0]
+        return self._upward(transmitted(self.entrance, landed * self.ground.meets, self._modes), 1e-3)[0]
 
     def upward(self, landed: NDArray[np.floating]) -> Array:
         """The same, ahead of where it went in."""
         entering = transmitted(self.entrance, landed * self.ground.meets)
         straight, _ = self.behind.passage.enter(entering)
-        return self._upward(entering[:, : self._modes], 1e-4, straight)[0]
+        return self._upward(entering[:, : self._modes], 1e-3, straight)[0]
 
-    def seen(self, landed: NDArray[np.floating]) -> tuple[Array, Seen]:
-        """`Light.upward` and `Light.seen` of weighted irradiance (n_led, layers, GRID, GRID)."""
+    def seen(self, landed: NDArray[np.floating]) -> Seen:
+        """What of all light goes to the camera, with the margin.
+
+        The traced part may be that of another press: what an inclusion changes in it is small. Light that has
+        walked far through the guide tells of the whole press, and is 5 % of what enters the contact where
+        LEDs shine in from air.
+        """
         entering = transmitted(self.entrance, landed * self.ground.meets)
         passage = self.behind.passage
         straight, glimpse = passage.enter(entering)
-        inside, upward = self._upward(entering[:, : self._modes], 1e-6, straight)
+        _, upward = self._upward(entering[:, : self._modes], 1e-6, straight)
         face = passage.face(self._fraction)
         further, again = passage.thrown_back(upward, face)
         more = np.zeros_like(upward)
         more[:, 0] = further
         more = self.behind.spread.solve(more, self._fraction, 1e-3)
         _, last = passage.thrown_back(more, face, even=True)
-        return inside + more[..., INSIDE, INSIDE], passage.towards_camera(glimpse, again, last)
+        return passage.towards_camera(glimpse, again, last)
+
+    def glanced(self, upward: Array) -> Seen:
+        """About what goes to the camera of all LEDs together, from `Light.upward`: enough to tell noise."""
+        steep = self.behind.coupling.lobes[:, -1]
+        maps = np.pad(np.einsum("i,niyx->yx", steep, upward), MARGIN)[None]
+        return Seen(maps, np.zeros(1), np.zeros(1))
 
     def _upward(
         self, entering: Array, tolerance: float, straight: Array | None = None

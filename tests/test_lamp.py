@@ -198,10 +198,8 @@ def test_light_from_below_balances(variant: str, coupling: str) -> None:
             renderer.scene,
             sensor,
             renderer.table,
-            renderer.basis,
-            renderer.behind,
-            ground,
-            straight,
+            transport.Under.at(renderer.basis, renderer.behind, ground),
+            straight.astype(np.float32),
             2**17,
             3,
         )

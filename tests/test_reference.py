@@ -194,7 +194,8 @@ def test_traced_light_is_the_same_bytes_on_one_thread_and_on_two(
     def upward(seed: int) -> np.ndarray:
         straight = direct.direct(SMALL, light.basis, shape)
         ground = transport.survey(scene, SMALL)
-        parts = (scene, SMALL, light.table, light.basis, light.behind, ground, straight)
+        under = transport.Under.at(light.basis, light.behind, ground)
+        parts = (scene, SMALL, light.table, under, straight.astype(np.float32))
         return transport.transport(*parts, 2**15, seed).upward
 
     found = []

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import fem
+from scenes.traced import LIGHT
 from twin import coarse as pixels
 from twin import objectives, touches
 from twin.design import Design
@@ -190,5 +191,5 @@ class Work:
     def _light_key(
         self, what: str, inclusion: fem.Inclusion, level: float, place: tuple[float, float]
     ) -> Any:
-        own = optical_key(self.design), self.quality, self.seed, self.bench.paths(self.quality)
+        own = optical_key(self.design), self.quality, self.seed, self.bench.paths(self.quality), LIGHT
         return self._key(what, inclusion, level, place), own, self.ground
