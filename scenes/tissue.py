@@ -11,6 +11,7 @@ right for every angle, and R_0 spreads light over about a millimetre. The others
 few times remembers (grazing light leaves at grazing angles): they have no net flux, return within a fraction
 of a mean free path, and are taken as local. Mode 1 makes what leaves towards the camera right for light from
 any angle; the next are the largest of what is left. W(A_r) is what the face throws back into the tissue.
+Where light comes out depends on how it came in: `aslant` and `passage` have that.
 """
 
 from __future__ import annotations
