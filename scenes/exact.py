@@ -125,8 +125,9 @@ class _View:
         inside = active & (column >= 0.0) & (column < self.columns) & (row >= 0.0) & (row < self.rows)
         pixel = mi.UInt32(dr.maximum(row, 0.0)) * self.columns + mi.UInt32(dr.maximum(column, 0.0))
         place = (number * (self.rows * self.columns) + pixel) * self.many
+        nearer = dr.rcp(dr.square(1.0 + self.spread_per_mm * point.z))  # what is nearer fills more of a pixel
         for k, amount in enumerate(amounts):
-            fixed = mi.Int64(dr.round(amount * _FIXED_POINT))
+            fixed = mi.Int64(dr.round(amount * nearer * _FIXED_POINT))
             dr.scatter_add(self.layers, fixed, place + k, inside)
 
     def collected(self) -> Array:
