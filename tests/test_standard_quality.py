@@ -114,7 +114,7 @@ def _bins_of(name: str) -> object:
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-@pytest.mark.parametrize("name", map(_bins_of, CASES))
+@pytest.mark.parametrize("name", [_bins_of(name) for name in CASES])
 def test_bins_are_the_references(variant: str, name: str) -> None:
     """Bins of 16 x 16 pixels within 3 %, borders and LED spots included."""
     standard, runs = pictures(name)
