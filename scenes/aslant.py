@@ -81,7 +81,7 @@ def aslant(body: Slab, transport_per_mm: float, lobes: Array) -> Aslant:
         known = there * seen if m == 0 else np.empty((0, cosine.size))
         share = np.linalg.lstsq(known.T, flat.T, rcond=None)[0].T
         left, sizes, shapes = np.linalg.svd(flat - share @ known, full_matrices=False)
-        rest = [np.abs((left[:, n:] * sizes[n:]) @ shapes[n:]).max() for n in range(sizes.size)]
+        rest = [np.abs((left[:, n:] * sizes[n:]) @ shapes[n:]).max() for n in range(sizes.size + 1)]
         count = int(np.argmax(np.array(rest) <= _ENOUGH))
         shares = (
             np.hstack([share, left[:, :count] * sizes[:count]]).reshape(2, diffuse.size, -1) / fine * peak

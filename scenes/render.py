@@ -45,7 +45,8 @@ class Rendering:
     surface : what is looked at.
     noise_percent : float
         Standard error of the radiance of all LEDs together from Monte Carlo: root mean square over pixels, in
-        per cent of the mean; from the spread of independent passes.
+        per cent of the mean; from the spread of independent passes (of gathered qualities by the light's main
+        way through the tissue alone, and without LEDs in sight).
     seconds : float
         Wall-clock time.
     sinks, trapped : (n_led, len(trace.SINKS)) and (n_led,), or None

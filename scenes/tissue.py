@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 
 MODES = 2
 _COSINES = 513
-_CAMERA = 0.985  # cosine in the tissue at which mode 1 is exact: what the camera sees
+_CAMERA = 0.985  # cosine in the tissue at which mode 1 is exact: about what the camera sees
 _LEAST = 1e-12  # reflectance below which nothing comes back
 
 
