@@ -29,6 +29,8 @@ def nothing() -> None:
 
 
 def waiting(folder: Path) -> None:
+    # A shell without job control starts what runs behind it with SIGINT ignored, and so do its children.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     each(wait, [folder / str(n) for n in range(6)], 1, nothing, lambda count: None)
 
 
