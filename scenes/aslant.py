@@ -29,10 +29,10 @@ _FINE_PER_MM = 1.5  # wave number of what is seen about half: light on a contact
 _AZIMUTHS, _WAVES = 24, 60
 _TOP = 25.0  # of k, 1/mean free path: beyond, all fall as 1/k
 _GRAZING = 0.1  # cosine below which little gets through any contact
-_NEARLY = 0.01  # of a cosine: step of the derivative at the normal
 _DARK = 1e-4  # answer whose parts do not matter
-ALL, STEEP = 0, 1
-"""What is asked of the light that comes out: all of it, or its radiance factor along the normal."""
+ALL, STEEP, DEEP = 0, 1, 2
+"""What is asked of the light that comes out: all of it; its radiance factor along the normal; the same times
+the depth of the last collision, mm."""
 
 
 @dataclass(frozen=True)
@@ -43,18 +43,15 @@ class Aslant:
     ----------
     functions : by harmonic m, (r_m, n)
         h_mr on cosines in the tissue uniform on 0..1; in harmonic 0 the tissue's lobes φ_i come first.
-    transforms : by harmonic m, (2, r_m, K)
-        X_mr of what `ALL` leaves, over the transform of Lambertian light, and of what leaves `STEEP`.
-    behind : (r_0,)
-        For light that leaves not quite along the normal: how far behind, mm per sine of the angle in the
-        tissue, the place is from which it seems to come, times its radiance factor; by functions of harmonic
-        0.
+    transforms : by harmonic m, (3, r_m, K)
+        X_mr of what `ALL` leaves, over the transform of Lambertian light, of what leaves `STEEP`, and `DEEP`.
+        Light that leaves not quite along the normal seems to come from behind, by that depth times the sine
+        of the angle in the tissue.
     """
 
     transport_per_mm: float
     functions: tuple[Array, ...]
     transforms: tuple[Array, ...]
-    behind: Array
 
     def at(self, transforms: Array, wave_per_mm: Array, tail: float) -> Array:
         """Transforms (..., K) at wave numbers, 1/mm: (..., *shape); beyond the last as k^-tail."""
@@ -77,28 +74,22 @@ def aslant(body: Slab, transport_per_mm: float, lobes: Array) -> Aslant:
     for m in range(HARMONICS + 1):
         part = by_harmonic[..., m] * (2.0 if m else 1.0)
         values = (part.imag if m % 2 else part.real) / peak * seen * fine
-        flat = values.reshape(-1, cosine.size)  # a row for each exit and wave number
+        flat = values[:DEEP].reshape(-1, cosine.size)  # a row for each exit and wave number
         known = there * seen if m == 0 else np.empty((0, cosine.size))
         share = np.linalg.lstsq(known.T, flat.T, rcond=None)[0].T
         left, sizes, shapes = np.linalg.svd(flat - share @ known, full_matrices=False)
         rest = [np.abs((left[:, n:] * sizes[n:]) @ shapes[n:]).max() for n in range(sizes.size + 1)]
         count = int(np.argmax(np.array(rest) <= _ENOUGH))
-        shares = (
-            np.hstack([share, left[:, :count] * sizes[:count]]).reshape(2, diffuse.size, -1) / fine * peak
-        )
+        shares = np.hstack([share, left[:, :count] * sizes[:count]]).reshape(DEEP, diffuse.size, -1)
+        every = np.vstack([known, shapes[:count]])  # enough for depths, too: they are asked for a small part
+        deep = np.linalg.lstsq(every.T, values[DEEP].T, rcond=None)[0].T
+        shares = np.concatenate([shares, deep[None]]) / fine * peak
         shares[ALL] /= np.maximum(diffuse, 1e-300)[:, None]
+        shares[DEEP] /= transport_per_mm
         transforms.append(np.moveaxis(shares, 1, 2))
         more = CubicSpline(cosine, shapes[:count] / seen, axis=1)(grid)
         functions.append(np.vstack([lobes, more]) if m == 0 else more)
-    # by reciprocity the run from the last collision is like that to the first one: with the radiance factor
-    # F(µ) = ∫ exp(-τ/µ) P(τ) dτ/µ its mean is sinθ (F + µ F')/(F µt')
-    near = 1.0 - np.array([_NEARLY, 0.0])
-    steep, normal = body.factors(near)
-    run = (normal + (normal - steep) / _NEARLY) / transport_per_mm
-    behind = np.linalg.lstsq(
-        (np.stack([np.interp(cosine, grid, one) for one in functions[0]]) * seen).T, run * seen, rcond=None
-    )[0]
-    return Aslant(transport_per_mm, tuple(functions), tuple(transforms), behind)
+    return Aslant(transport_per_mm, tuple(functions), tuple(transforms))
 
 
 @lru_cache(maxsize=16)

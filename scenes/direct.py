@@ -28,7 +28,8 @@ CELLS = 200  # of the grid of target points, per side
 DISC_POINTS = 96
 _NEWTON_STEPS = 7  # from a guess
 _NEWTON_AGAIN = 1, 2  # from what the disc's point before foretold, if there are so many points, or fewer
-_STRIPES = 9
+_DIRECTIONS = 24  # of a disc: neighbouring points' light counts as coming from its mean direction
+_STRIPES = 4
 _GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 
 
@@ -90,6 +91,7 @@ def on(sensor: Sensor, basis: AngularBasis, ground: Array, points: int = DISC_PO
 
     disc = _float(_disc_points(points))
     end, steps = dr.opaque(mi.UInt32, points), _NEWTON_AGAIN[points < DISC_POINTS]
+    together = dr.opaque(mi.UInt32, max(points // _DIRECTIONS, 1))
 
     index = dr.arange(mi.UInt32, n_led * CELLS * CELLS)
     led, point = index // (CELLS * CELLS), index % (CELLS * CELLS)
@@ -101,17 +103,33 @@ def on(sensor: Sensor, basis: AngularBasis, ground: Array, points: int = DISC_PO
         return number < end
 
     def add(number, straight, mirrored, *total):  # type: ignore[no-untyped-def]
-        on_disc = dr.gather(mi.Point2f, disc, number)
-        onwards = dr.gather(mi.Point2f, disc, dr.minimum(number + 1, end - 1)) - on_disc
-        slopes = []
-        for by_glass, begin in ((False, straight), (True, mirrored)):
-            flux, (cosine, d_x, d_y), slope = _arrives(
-                sensor, source, on_disc, here, by_glass, begin, onwards, steps
-            )
+        until = dr.minimum(number + together, end)
+
+        def within(number, straight, mirrored, *sums):  # type: ignore[no-untyped-def]
+            return number < until
+
+        def gather(number, straight, mirrored, *sums):  # type: ignore[no-untyped-def]
+            on_disc = dr.gather(mi.Point2f, disc, number)
+            onwards = dr.gather(mi.Point2f, disc, dr.minimum(number + 1, end - 1)) - on_disc
+            slopes, after = [], []
+            for by_glass, begin, so_far in ((False, straight, sums[:4]), (True, mirrored, sums[4:])):
+                flux, arriving, slope = _arrives(
+                    sensor, source, on_disc, here, by_glass, begin, onwards, steps
+                )
+                after += [so_far[0] + flux]
+                after += [whole + flux * part for whole, part in zip(so_far[1:], arriving, strict=True)]
+                slopes.append(slope)
+            return number + 1, *slopes, *after
+
+        nothing = [mi.Float(0.0) for _ in range(8)]
+        number, straight, mirrored, *sums = dr.while_loop(
+            (number, straight, mirrored, *nothing), within, gather
+        )
+        for flux, *arriving in (sums[:4], sums[4:]):
+            cosine, d_x, d_y = (part / dr.maximum(flux, 1e-30) for part in arriving)
             weight = weights.at(cosine, d_x, d_y, flux > 0.0)
-            total = tuple(sum_ + flux * w for sum_, w in zip(total, weight, strict=True))
-            slopes.append(slope)
-        return number + 1, *slopes, *total
+            total = tuple(whole + flux * w for whole, w in zip(total, weight, strict=True))
+        return number, straight, mirrored, *total
 
     first = dr.gather(mi.Point2f, disc, dr.zeros(mi.UInt32, dr.width(index)))
     begin = [_first_guess(sensor, source, first, here, by_glass) for by_glass in (False, True)]
@@ -127,7 +145,7 @@ def _middles(half: float) -> Array:
 
 
 def _disc_points(count: int = DISC_POINTS) -> Array:
-    """Points (count, 2) of the unit disc, a sunflower of equal areas, each near the one before."""
+    """Points (count, 2) of the unit disc, a sunflower of equal areas, those in a row close together."""
     radius = np.sqrt((np.arange(count) + 0.5) / count)
     angle = _GOLDEN_ANGLE * np.arange(count)
     points = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)

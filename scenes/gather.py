@@ -38,9 +38,11 @@ class Sight:
         For each sight, on the device: position in units of the guide's width (0..1), and radiance at the
         camera per light that goes up in the tissue, 1/sr.
     lean : (x, y)
-        Direction of the pixels' rays in the tissue, up: sines along the face, over the guide's width, 1/mm.
+        Direction of the pixels' rays in the tissue, up: sines along the surface there.
     off_normal
         1 less the cosine of their angle in the tissue.
+    width_mm
+        Of the guide's face.
     windows : (sights, rows, columns)
         Radiance at the camera over that in the guide, for each sight.
     lamps : (n_led, rows, columns)
@@ -51,6 +53,7 @@ class Sight:
     points: list[tuple[mi.Float, mi.Float, mi.Float]]
     lean: tuple[mi.Float, mi.Float]
     off_normal: mi.Float
+    width_mm: float
     windows: NDArray[np.float32]
     lamps: NDArray[np.float32]
 
@@ -69,9 +72,10 @@ def look(scene: mi.Scene, sensor: Sensor, table: Table, coupling: Coupling, rays
     # the run in the glass and back, near the axis, as one in the guide
     in_glass = 2.0 * sensor.glass.thickness_mm * guide.refractive_index / sensor.glass.refractive_index
     lamps, patterns = [mi.Float(0.0) for _ in sensor.leds], Patterns(sensor.leds)
-    points, windows = [], []
+    points: list[tuple[mi.Float, mi.Float, mi.Float]] = []
+    windows = []
     # sine of the angle in the tissue, by Snell's law
-    bend = float(np.sqrt(coupling.scale)) / guide.width_mm
+    bend = float(np.sqrt(coupling.scale))
     start = mi.Point3f(*origin) + _STEP_MM / direction.z * direction
     for _ in range(_SIGHTS):
         si = meet(scene, named["contact"], start, direction)
@@ -79,6 +83,8 @@ def look(scene: mi.Scene, sensor: Sensor, table: Table, coupling: Coupling, rays
         _add_lamps(lamps, si, gain, sensor, named, patterns)
         windows.append(gain)
         cosine = mi.Frame3f.cos_theta(si.wi)
+        if not points:
+            lean = direction - dr.dot(direction, si.sh_frame.n) * si.sh_frame.n
         fraction = dr.select(seen, contact.eval_attribute_1("vertex_contact_fraction", si, seen), 0.0)
         transmitted = table.transmittance(fraction, cosine, seen)
         emitted = dr.select(seen, gain * transmitted * (coupling.scale * dr.inv_pi), 0.0)
@@ -96,9 +102,7 @@ def look(scene: mi.Scene, sensor: Sensor, table: Table, coupling: Coupling, rays
             run * direction.x, run * direction.y, 0.0
         )
         start += _STEP_MM / direction.z * direction
-    lean = (bend * direction.x, bend * direction.y)
-    sine2 = coupling.scale * (dr.square(direction.x) + dr.square(direction.y))
-    off_normal = 1.0 - dr.sqrt(dr.maximum(1.0 - sine2, 0.0))
+    off_normal = 1.0 - dr.sqrt(dr.maximum(1.0 - coupling.scale * dr.squared_norm(lean), 0.0))
     dr.eval(points, windows, lamps, lean, off_normal)
     x, y = (np.asarray(points[0][i]).reshape(shape) for i in (0, 1))
     position = (np.stack([x, y], axis=-1) - 0.5) * guide.width_mm
@@ -106,7 +110,8 @@ def look(scene: mi.Scene, sensor: Sensor, table: Table, coupling: Coupling, rays
         [np.broadcast_to(np.asarray(layer), rays.transmittance.size).reshape(shape) for layer in lamps]
     )
     through = np.stack([np.asarray(window).reshape(shape) for window in windows])
-    return Sight(position.astype(np.float32), points, lean, off_normal, through, layers)
+    where = position.astype(np.float32)
+    return Sight(where, points, (bend * lean.x, bend * lean.y), off_normal, guide.width_mm, through, layers)
 
 
 def meet(
@@ -197,16 +202,19 @@ def picture(sight: Sight, seen: Seen, margin: int, *, lamps: bool = True) -> NDA
     """
     n_led, cells = len(seen.maps), seen.maps.shape[-1]
     inside = 1.0 - 2.0 * margin / cells
+    lean = sight.lean
     total = [mi.Float(0.0) for _ in range(n_led)]
     for x, y, gain in sight.points:
-        for led, behind in enumerate(seen.behind_mm):
+        for led, behind in enumerate(seen.behind_mm / sight.width_mm):
             away = dr.opaque(mi.Float, float(behind))
             place = [
-                inside * (at + away * lean) + margin / cells
-                for at, lean in zip((x, y), sight.lean, strict=True)
+                inside * (at + away * sine) + margin / cells for at, sine in zip((x, y), lean, strict=True)
             ]
-            brighter = 1.0 + dr.opaque(mi.Float, float(seen.steeper[led])) * sight.off_normal
-            total[led] += gain * brighter * look_up(seen.maps[led][None], *place)[0]
+            found, *aslant = look_up(seen.maps[led], *place)
+            found *= 1.0 + dr.opaque(mi.Float, float(seen.steeper[led])) * sight.off_normal
+            for rise, how in zip(aslant, (sight.off_normal, *lean), strict=False):
+                found += rise * how
+            total[led] += gain * found
     dr.eval(total)
     shape = (n_led, *sight.position_mm.shape[:2])
     found = np.stack([np.asarray(layer) for layer in total]).reshape(shape)

@@ -6,13 +6,14 @@ leaves and for what leaves towards the camera, which comes from deeper; and so i
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from .aslant import ALL, STEEP
+from .aslant import ALL, DEEP, STEEP
 from .tissue import Coupling
 
 Array = NDArray[np.float64]
@@ -31,11 +32,11 @@ class Face:
 
 @dataclass(frozen=True)
 class Glimpse:
-    """What of the first pass leaves along the normal: Fourier transforms (n, p, p // 2 + 1), and the sums of
-    light times how far behind it lies, (n,) as `Aslant.behind`."""
+    """What of a pass leaves along the normal, and the same times its depth, mm: Fourier transforms
+    (n, p, p // 2 + 1)."""
 
     spectra: NDArray[np.complex64]
-    behind: Array
+    deep: NDArray[np.complex64]
 
 
 @dataclass(frozen=True)
@@ -44,18 +45,26 @@ class Seen:
 
     Attributes
     ----------
-    maps : (n, m, m)
+    maps : (n, 4, m, m)
         π times the radiance in the tissue along the normal, W/mm², on cells [iy, ix] of the guide's face and
-        a margin beside it.
+        a margin beside it. Then of what leaves aslant, beyond what `behind_mm` and `steeper` say of all: its
+        further rise per 1 - cosine, and per sine of the angle in the tissue towards +x and +y, W/mm². Or
+        (n, 1, m, m) without them.
     behind_mm : (n,)
         How far behind, mm per sine of the angle in the tissue, light is to be looked up that leaves aslant.
     steeper : (n,)
         Its relative rise per 1 - cosine: what leaves aslant has come from less deep.
     """
 
-    maps: Array
+    maps: NDArray[np.floating]
     behind_mm: Array
     steeper: Array
+
+    @staticmethod
+    def of(parts: Sequence[Seen]) -> Seen:
+        """Of several sources."""
+        columns = zip(*((one.maps, one.behind_mm, one.steeper) for one in parts), strict=True)
+        return Seen(*(np.concatenate(column) for column in columns))
 
 
 @dataclass(frozen=True)
@@ -64,9 +73,9 @@ class Passage:
 
     Attributes
     ----------
-    entering, seen : (functions, p, p // 2 + 1)
+    entering, seen, deep : (functions, p, p // 2 + 1)
         Fourier transforms of the kernels, over cells, padded so that nothing wraps round: of Lambertian light
-        that comes out as all that entered does, and of the light towards the camera.
+        that comes out as all that entered does, of the light towards the camera, and of that times its depth.
     shift : (p, p // 2 + 1)
         Moves the origin from the guide's first cell to the margin's.
     rings, turns
@@ -75,12 +84,15 @@ class Passage:
         Of the guide's face per side, and beside it.
     thrown, free : by harmonic, (n_fraction, r, r) and (r, r)
         Of `tissue.Coupling`.
-    transport_per_mm, behind
+    transport_per_mm
         Of `aslant.Aslant`.
+    cell_mm
+        Side of a cell.
     """
 
     entering: NDArray[np.complex64]
     seen: NDArray[np.complex64]
+    deep: NDArray[np.complex64]
     shift: NDArray[np.complex64]
     rings: int
     turns: int
@@ -89,18 +101,20 @@ class Passage:
     thrown: tuple[Array, ...]
     free: tuple[Array, ...]
     transport_per_mm: float
-    behind: Array
+    cell_mm: float
 
-    def enter(self, maps: Array) -> tuple[Array, Glimpse]:
+    def enter(self, maps: Array, *, glimpse: bool = True) -> tuple[Array, Glimpse]:
         """From maps (n, functions, m, m) of what enters, W/mm²: Lambertian irradiance that would come out as
-        it does, (n, cells, cells) with the margin; and what of the first pass leaves along the normal."""
-        entering, glimpse = self._nothing(len(maps))
+        it does, (n, cells, cells) with the margin; and what of the first pass leaves along the normal, or
+        nothing where no `glimpse` is asked for."""
+        entering, found = self._nothing(len(maps))
         for number, one in enumerate(maps):
             spectra = self._forth(one)
             entering[number] = self._back(self.shift * _summed(spectra, self.entering))
-            glimpse.spectra[number] = self.shift * _summed(spectra, self.seen)
-            glimpse.behind[number] = self.behind @ one[: self.rings].sum(axis=(1, 2))
-        return entering, glimpse
+            if glimpse:
+                found.spectra[number] = self.shift * _summed(spectra, self.seen)
+                found.deep[number] = self.shift * _summed(spectra, self.deep)
+        return entering, found
 
     def face(self, fraction: Array) -> Face:
         """The face where the real contact fraction is (cells, cells), not a number where no guide is but bare
@@ -128,7 +142,7 @@ class Passage:
         upward : (n, modes, cells, cells)
             V, from `spread`.
         even
-            Leave out what turns with the azimuth.
+            Leave out what turns with the azimuth, as depths do always.
         """
         rings, light = slice(self.rings), upward.astype(np.float32)
         turning = self.turns > 0 and not even
@@ -136,8 +150,8 @@ class Passage:
         entering, glimpse = self._nothing(len(light))
         for number, fields in enumerate(light):
             thrown = _weighed(face.even[:, : len(fields)], fields)
-            glimpse.behind[number] = self.behind @ thrown.sum(axis=(1, 2), dtype=np.float64)
             spectra = self._forth(thrown)
+            glimpse.deep[number] = _summed(spectra, self.deep[rings])
             found, seen = (
                 _summed(spectra, self.entering[rings]) - spectra[0],
                 _summed(spectra, self.seen[rings]),
@@ -152,17 +166,28 @@ class Passage:
 
     def towards_camera(self, *glimpses: Glimpse) -> Seen:
         """What leaves towards the camera, all passes together."""
-        seen, _ = self._nothing(len(glimpses[0].behind))
-        for number in range(len(seen)):
-            seen[number] = self._back(np.sum([one.spectra[number] for one in glimpses], axis=0))
-        behind = np.sum([one.behind for one in glimpses], axis=0) / np.maximum(seen.sum(axis=(1, 2)), 1e-300)
-        return Seen(seen, behind, 1.0 - self.transport_per_mm * behind)
+        count = len(glimpses[0].spectra)
+        maps, behind = np.empty((count, 4, *self._wide), np.float32), np.empty(count)
+        for number in range(count):
+            spectrum = np.sum([one.spectra[number] for one in glimpses], axis=0)
+            deep = np.sum([one.deep[number] for one in glimpses], axis=0)
+            behind[number] = deep[0, 0].real / max(spectrum[0, 0].real, 1e-30)
+            maps[number, 0] = self._back(spectrum)
+            # what is not the same all over
+            deeper = self._back(deep - np.float32(behind[number]) * spectrum)
+            maps[number, 1] = -self.transport_per_mm * deeper
+            maps[number, 3], maps[number, 2] = np.gradient(deeper, self.cell_mm)
+        return Seen(maps, behind, 1.0 - self.transport_per_mm * behind)
+
+    @property
+    def _wide(self) -> tuple[int, int]:
+        wide = self.cells + 2 * self.margin
+        return wide, wide
 
     def _nothing(self, count: int) -> tuple[Array, Glimpse]:
         """Room for so many LEDs' light."""
-        wide = self.cells + 2 * self.margin
-        spectra = np.zeros((count, *self.shift.shape), dtype=np.complex64)
-        return np.zeros((count, wide, wide)), Glimpse(spectra, np.zeros(count))
+        spectra, deep = np.zeros((2, count, *self.shift.shape), dtype=np.complex64)
+        return np.zeros((count, *self._wide)), Glimpse(spectra, deep)
 
     def _forth(self, maps: NDArray[np.floating]) -> NDArray[np.complex64]:
         padded = len(self.shift)
@@ -170,7 +195,7 @@ class Passage:
         return np.asarray(scipy.fft.fft(rows, padded, axis=-2, workers=1, overwrite_x=True))
 
     def _back(self, spectrum: NDArray[np.complex64]) -> NDArray[np.float32]:
-        padded, wide = len(self.shift), self.cells + 2 * self.margin
+        padded, (wide, _) = len(self.shift), self._wide
         rows = scipy.fft.ifft(spectrum, axis=-2, workers=1)[..., :wide, :]
         return np.asarray(scipy.fft.irfft(rows, padded, axis=-1, workers=1)[..., :wide])
 
@@ -195,16 +220,17 @@ def passage(coupling: Coupling, width_mm: float, cells: int, margin: int) -> Pas
     kx, ky = (2.0 * np.pi * waves(padded, step) for waves in (scipy.fft.rfftfreq, scipy.fft.fftfreq))
     k, azimuth = np.hypot(kx, ky[:, None]), np.arctan2(ky[:, None], kx)
     shift = np.exp(-1j * margin * step * (kx + ky[:, None])).astype(np.complex64)
-    kernels: tuple[list[NDArray[np.complex64]], ...] = ([], [])
+    kernels: tuple[list[NDArray[np.complex64]], ...] = ([], [], [])
     for m, transforms in enumerate(apart.transforms):
         for turn in (np.cos, np.sin) if m else (np.cos,):
-            for what, tail in ((ALL, 0.0), (STEEP, 1.0)):
+            for what, tail in ((ALL, 0.0), (STEEP, 1.0), (DEEP, 2.0)):
                 found = apart.at(transforms[what], k, tail) * turn(m * azimuth) * (1j if m % 2 else 1.0)
                 kernels[what].extend(found.astype(np.complex64))
-    entering, seen = (np.array(one, dtype=np.complex64) for one in kernels)
+    entering, seen, deep = (np.array(one, dtype=np.complex64) for one in kernels)
     return Passage(
         entering,
         seen,
+        deep,
         shift,
         len(apart.functions[0]),
         len(apart.functions[1]),
@@ -213,5 +239,5 @@ def passage(coupling: Coupling, width_mm: float, cells: int, margin: int) -> Pas
         thrown=coupling.thrown,
         free=coupling.thrown_free,
         transport_per_mm=apart.transport_per_mm,
-        behind=apart.behind,
+        cell_mm=step,
     )

@@ -23,6 +23,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 _COUNT = 40
+_NORMAL = 1.0 + 1e-7  # off the pole where a mode falls as fast
+_STEP = 3e-3  # of it, for derivatives
 _LEAST_ABSORBED = 1e-9  # per scattering: a white slab has no unique solution at k = 0
 
 
@@ -88,11 +90,12 @@ class Slab:
         return np.asarray(self.factors(cosine) @ (2.0 * mu * weight))
 
     def aslant(self, k: Array, cosine: Array, azimuth: Array) -> NDArray[np.complex128]:
-        """Fourier transform of where a beam comes out, (2, n_k, n_cos, n_azimuth).
+        """Fourier transform of where a beam comes out, (3, n_k, n_cos, n_azimuth).
 
         Of unit irradiance that enters at cosines (n_cos,) > 0 and azimuths (n_azimuth,), rad, to the wave
         vector of length k (n_k,): (0) of all light that leaves; its total is the plane albedo. (1) Of the
-        radiance factor π L / E along the normal. The place r counts as exp(-i k·r).
+        radiance factor π L / E along the normal. (2) Of the same times the depth of the last collision. The
+        place r counts as exp(-i k·r).
 
         The beam falls with depth as exp(-p z), p = 1/µ + i k tanθ cosφ. Where it collides, light is like that
         of an isotropic source; what such a source at z sends out is by reciprocity the field G(z) of light
@@ -101,20 +104,22 @@ class Slab:
         """
         inward = np.asarray(cosine, dtype=np.float64)[:, None]
         ahead = np.sqrt(1.0 - inward**2) / inward * np.cos(azimuth)
-        found = np.empty((2, len(k), len(inward), len(azimuth)), dtype=np.complex128)
+        found = np.empty((4, len(k), len(inward), len(azimuth)), dtype=np.complex128)
+        falls = _NORMAL + np.array([0.0, -_STEP, _STEP])  # of light on its way out, with depth
         for number, wave in enumerate(np.asarray(k, dtype=np.float64)[:, None]):
             p = 1.0 / inward + 1j * wave * ahead
             rates, falling, rising = diffuse = self._diffuse_field(wave)
-            for part, field in enumerate((diffuse, self._steep_field(wave))):
+            for part, field in enumerate((diffuse, *(self._steep_field(wave, fall) for fall in falls))):
                 found[part, number] = self.albedo / inward * self._overlap(p, *field)
             if self.backing > 0.0:
                 up, down = self._passes(wave)
                 mirrored = rates, rising, falling
                 arrives = np.exp(-p * self.depth) + self.albedo / inward * self._overlap(p, *mirrored)
-                steep = np.exp(-self.depth) + self.albedo * self._overlap(np.ones((1, 1)), *mirrored)
+                steep = np.exp(-falls * self.depth) + self.albedo * self._overlap(falls, *mirrored)
                 again = self.backing / (1.0 - self.backing * up) * arrives
-                found[:, number] += again * np.stack([down[:, None], steep])
-        return found
+                found[:, number] += again * np.append(down, steep)[:, None, None]
+        found[2] = (found[2] - found[3]) / (2.0 * _STEP)
+        return found[:3]
 
     def _diffuse_field(self, k: Array) -> tuple[Array, Array, Array]:
         """G(z) of all light that leaves, at one wave number (1,): rates λ of modes, and amplitudes of
@@ -125,11 +130,11 @@ class Slab:
         unit = (np.sqrt(weight) / mu) @ vectors
         return rate[0], unit * falling[0, :, 0], unit * rising[0, :, 0]
 
-    def _steep_field(self, k: Array) -> tuple[Array, Array, Array]:
-        """The same of the radiance factor along the normal: C exp(-z), and modes that undo it at faces."""
+    def _steep_field(self, k: Array, normal: float) -> tuple[Array, Array, Array]:
+        """The same of the radiance factor along the normal, where light falls as exp(-normal z), in truth 1:
+        C exp(-normal z), and modes that undo it at faces."""
         mu, weight = cosines()
         q, rate, vectors = self._rates(k)
-        normal = 1.0 + 1e-7  # off the pole where a mode falls as fast
         own = 0.25 / (1.0 - self.albedo * np.sum(weight / (mu**2 * (q**2 - normal**2)), axis=1))
         shape = (-0.5 * self.albedo * own[:, None])[..., None]
         falling, rising = self._amplitudes(k, shape / (q - normal)[..., None])

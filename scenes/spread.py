@@ -51,69 +51,22 @@ class Spread:
     back: Array
 
     def solve(self, entering: Array, fraction: Array, tolerance: float = 1e-6) -> Array:
-        """Light that goes up under the face.
+        """Light that goes up under the face: `Bed.solve` of `on`."""
+        return self.on(fraction).solve(entering, tolerance)
 
-        Parameters
-        ----------
-        entering : (n_led, modes, m, m)
-            E_i, W/mm²: irradiance that enters the tissue, weighted with the lobes φ_i; cells [iy, ix].
-        fraction : (m, m)
-            Real contact fraction; not a number where there is no guide but bare skin.
-        tolerance
-            Of the largest residual, relative to what enters.
-
-        Returns
-        -------
-        (n_led, modes, m, m)
-            V_i, W/mm²; the guide sees the radiance (n1/n3)² T(A_r, cos) Σ φ_i V_i / π.
-        """
-        nodes = np.linspace(0.0, 1.0, self.held.size)
-
-        bare = np.isnan(fraction)
-        fraction = np.where(bare, 0.0, fraction)
+    def on(self, fraction: Array) -> Bed:
+        """Under a face whose real contact fraction is (m, m); not a number where there is no guide but bare
+        skin."""
+        nodes, bare = np.linspace(0.0, 1.0, self.held.size), np.isnan(fraction)
+        known = np.where(bare, 0.0, fraction)
 
         def at(table: Array) -> Array:
-            return np.asarray(np.interp(fraction, nodes, table))
+            flat = table.reshape(len(nodes), -1)
+            found = np.stack([np.interp(known, nodes, column) for column in flat.T])
+            return found.reshape(*table.shape[1:], *known.shape)
 
-        modes = range(1, entering.shape[1])
-        source = entering[:, 0]
-        for i in modes:
-            source = source + at(self.feed[:, i - 1]) * entering[:, i]
-        result = np.empty(entering.shape)
         excess = np.where(bare, 0.0, at(self.held) - self.free)
-        result[:, 0] = self._conjugate(source, excess, tolerance)
-        for i in modes:
-            sent = entering[:, i] + at(self.back[:, i - 1]) * result[:, 0]
-            for k in modes:
-                part = at(self.local[:, k - 1, i - 1]) * sent
-                result[:, k] = part if i == 1 else result[:, k] + part
-        return result
-
-    def _conjugate(self, source: Array, excess: Array, tolerance: float) -> Array:
-        """V = M [E + (w - w0) V] by conjugate gradients for x, V = M x, in the inner product of M.
-
-        There I - (w - w0) M is self-adjoint and positive, and a round costs one M (Hestenes & Stiefel 1952;
-        key hestenes1952). M is applied in single precision, always to a residual: the error shrinks with it.
-        """
-        residual, found = source, np.zeros_like(source)
-        if np.abs(self.transform).max() < _BLACK:  # a black sheet: no round would get nearer
-            return found
-        spread = self.convolve(residual)
-        way, spread_way = residual, spread
-        power = _dot(residual, spread)
-        limit = tolerance * np.abs(source).max(axis=(1, 2))
-        for _ in range(_MOST_ROUNDS):
-            image = way - excess * spread_way
-            step = (power / np.maximum(_dot(image, spread_way), _NONE))[:, None, None]
-            found = found + step * spread_way
-            residual = residual - step * image
-            if np.all(np.abs(residual).max(axis=(1, 2)) <= limit):
-                break
-            spread = self.convolve(residual)
-            before, power = power, _dot(residual, spread)
-            turn = (power / np.maximum(before, _NONE))[:, None, None]
-            way, spread_way = residual + turn * way, spread + turn * spread_way
-        return found
+        return Bed(self, excess, at(self.feed), at(self.local), at(self.back))
 
     def convolve(self, light: Array) -> Array:
         """M applied to (n, m, m)."""
@@ -123,6 +76,79 @@ class Spread:
         both *= self.transform
         rows = scipy.fft.ifft(both, axis=1, workers=1, overwrite_x=True)[:, : self.cells]
         return scipy.fft.irfft(rows, padded, axis=2, workers=1)[..., : self.cells].astype(np.float64)
+
+
+@dataclass(frozen=True)
+class Bed:
+    """A `Spread` under one face; make it with `Spread.on`.
+
+    Attributes
+    ----------
+    excess : (m, m)
+        w - w0 on cells.
+    feed, local, back : (l, m, m), (l, l, m, m), (l, m, m)
+        As of `Spread`.
+    """
+
+    spread: Spread
+    excess: Array
+    feed: Array
+    local: Array
+    back: Array
+
+    def solve(self, entering: Array, tolerance: float = 1e-6) -> Array:
+        """Light that goes up under the face.
+
+        Parameters
+        ----------
+        entering : (n_led, modes, m, m)
+            E_i, W/mm²: irradiance that enters the tissue, weighted with the lobes φ_i; cells [iy, ix].
+        tolerance
+            Of the largest residual, relative to what enters.
+
+        Returns
+        -------
+        (n_led, modes, m, m)
+            V_i, W/mm²; the guide sees the radiance (n1/n3)² T(A_r, cos) Σ φ_i V_i / π.
+        """
+        modes = range(1, entering.shape[1])
+        source = entering[:, 0]
+        for i in modes:
+            source = source + self.feed[i - 1] * entering[:, i]
+        result = np.empty(entering.shape)
+        result[:, 0] = self._conjugate(source, tolerance)
+        for i in modes:
+            sent = entering[:, i] + self.back[i - 1] * result[:, 0]
+            for k in modes:
+                part = self.local[k - 1, i - 1] * sent
+                result[:, k] = part if i == 1 else result[:, k] + part
+        return result
+
+    def _conjugate(self, source: Array, tolerance: float) -> Array:
+        """V = M [E + (w - w0) V] by conjugate gradients for x, V = M x, in the inner product of M.
+
+        There I - (w - w0) M is self-adjoint and positive, and a round costs one M (Hestenes & Stiefel 1952;
+        key hestenes1952). M is applied in single precision, always to a residual: the error shrinks with it.
+        """
+        residual, found = source, np.zeros_like(source)
+        if np.abs(self.spread.transform).max() < _BLACK:  # a black sheet: no round would get nearer
+            return found
+        spread = self.spread.convolve(residual)
+        way, spread_way = residual, spread
+        power = _dot(residual, spread)
+        limit = tolerance * np.abs(source).max(axis=(1, 2))
+        for _ in range(_MOST_ROUNDS):
+            image = way - self.excess * spread_way
+            step = (power / np.maximum(_dot(image, spread_way), _NONE))[:, None, None]
+            found = found + step * spread_way
+            residual = residual - step * image
+            if np.all(np.abs(residual).max(axis=(1, 2)) <= limit):
+                break
+            spread = self.spread.convolve(residual)
+            before, power = power, _dot(residual, spread)
+            turn = (power / np.maximum(before, _NONE))[:, None, None]
+            way, spread_way = residual + turn * way, spread + turn * spread_way
+        return found
 
 
 def spreader(tissue: TissueOptics, coupling: Coupling, width_mm: float, cells: int) -> Spread:

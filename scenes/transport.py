@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import trace
+from .abreast import abreast
 from .bsdf import Table
 from .gather import meet
 from .irradiance import AngularBasis, Entrance, smooth, transmitted
-from .passage import Passage, Seen
+from .passage import Face, Passage, Seen
 from .sensor import Led, Sensor
-from .spread import Spread
+from .spread import Bed, Spread
 from .tissue import Coupling
 
 Array = NDArray[np.float64]
@@ -183,21 +184,34 @@ class Under:
     entrance: Entrance
     behind: Behind
     ground: Ground
+    bed: Bed
+    face: Face
 
     @staticmethod
     def at(basis: AngularBasis, behind: Behind, ground: Ground) -> Under:
-        return Under(Entrance.at(basis, ground.fraction), behind, ground)
+        fraction = np.pad(ground.fraction, MARGIN, constant_values=np.nan)
+        entrance, face = Entrance.at(basis, ground.fraction), behind.passage.face(fraction)
+        return Under(entrance, behind, ground, behind.spread.on(fraction), face)
 
     def again(self, landed: NDArray[np.floating]) -> Array:
         """Light that goes up in the tissue, (n_led, modes, GRID, GRID), as if it had entered evenly from all
         sides: enough for light that has been in the tissue before."""
-        return self._upward(transmitted(self.entrance, landed * self.ground.meets, self._modes), 1e-3)[0]
+
+        def one(number: int) -> Array:
+            some = landed[number : number + 1] * self.ground.meets
+            return self._upward(transmitted(self.entrance, some, self._modes), 1e-3)[0]
+
+        return np.concatenate(abreast(one, len(landed)))
 
     def upward(self, landed: NDArray[np.floating]) -> Array:
         """The same, ahead of where it went in."""
-        entering = transmitted(self.entrance, landed * self.ground.meets)
-        straight, _ = self.behind.passage.enter(entering)
-        return self._upward(entering[:, : self._modes], 1e-3, straight)[0]
+
+        def one(number: int) -> Array:
+            entering = transmitted(self.entrance, landed[number : number + 1] * self.ground.meets)
+            straight = self.behind.passage.enter(entering, glimpse=False)[0]
+            return self._upward(entering[:, : self._modes], 1e-3, straight)[0]
+
+        return np.concatenate(abreast(one, len(landed)))
 
     def seen(self, landed: NDArray[np.floating]) -> Seen:
         """What of all light goes to the camera, with the margin.
@@ -206,22 +220,25 @@ class Under:
         walked far through the guide tells of the whole press, and is 5 % of what enters the contact where
         LEDs shine in from air.
         """
-        entering = transmitted(self.entrance, landed * self.ground.meets)
         passage = self.behind.passage
-        straight, glimpse = passage.enter(entering)
-        _, upward = self._upward(entering[:, : self._modes], 1e-6, straight)
-        face = passage.face(self._fraction)
-        further, again = passage.thrown_back(upward, face)
-        more = np.zeros_like(upward)
-        more[:, 0] = further
-        more = self.behind.spread.solve(more, self._fraction, 1e-3)
-        _, last = passage.thrown_back(more, face, even=True)
-        return passage.towards_camera(glimpse, again, last)
+
+        def one(number: int) -> Seen:
+            entering = transmitted(self.entrance, landed[number : number + 1] * self.ground.meets)
+            straight, glimpse = passage.enter(entering)
+            _, upward = self._upward(entering[:, : self._modes], 1e-6, straight)
+            further, again = passage.thrown_back(upward, self.face)
+            more = np.zeros_like(upward)
+            more[:, 0] = further
+            more = self.bed.solve(more, 1e-3)
+            _, last = passage.thrown_back(more, self.face, even=True)
+            return passage.towards_camera(glimpse, again, last)
+
+        return Seen.of(abreast(one, len(landed)))
 
     def glanced(self, upward: Array) -> Seen:
         """About what goes to the camera of all LEDs together, from `Light.upward`: enough to tell noise."""
         steep = self.behind.coupling.lobes[:, -1]
-        maps = np.pad(np.einsum("i,niyx->yx", steep, upward), MARGIN)[None]
+        maps = np.pad(np.einsum("i,niyx->yx", steep, upward), MARGIN)[None, None]
         return Seen(maps, np.zeros(1), np.zeros(1))
 
     def _upward(
@@ -231,13 +248,9 @@ class Under:
         wide = np.pad(entering, ((0, 0), (0, 0), (MARGIN, MARGIN), (MARGIN, MARGIN)))
         if straight is not None:
             wide[:, 0] = straight
-        found = self.behind.spread.solve(wide, self._fraction, tolerance)
+        found = self.bed.solve(wide, tolerance)
         return found[..., INSIDE, INSIDE], found
 
     @property
     def _modes(self) -> int:
         return len(self.behind.coupling.lobes)
-
-    @property
-    def _fraction(self) -> Array:
-        return np.pad(self.ground.fraction, MARGIN, constant_values=np.nan)

@@ -85,7 +85,7 @@ def test_even_light_is_seen_as_the_local_limit_says(node: int) -> None:
         wide = np.pad(maps[:, :modes], ((0, 0), (0, 0), (MARGIN, MARGIN), (MARGIN, MARGIN)))
         wide[:, 0] = straight
         upward = spread.solve(wide, fraction)
-        seen = first.towards_camera(glimpse, first.thrown_back(upward, first.face(fraction))[1]).maps[0]
+        seen = first.towards_camera(glimpse, first.thrown_back(upward, first.face(fraction))[1]).maps[0, 0]
         local = coupling.gain[node] / coupling.scale @ factors[:modes]
         expected = body.lobes[:, -1] @ local
         assert seen[wide_cells // 2, wide_cells // 2] == pytest.approx(expected, rel=1e-3)

@@ -66,9 +66,14 @@ def test_beams_come_out_as_the_wiener_hopf_solution_says(albedo: float, k: float
     q, one = np.sqrt(node**-2 + k**2), np.ones(1)
     h, leaving = h_function(p, albedo, k), weight * h_function(q, albedo, k)
     everything = 0.5 * albedo * h / mu * (leaving / (p[..., None] + q)).sum(axis=-1)
-    steep = 0.25 * albedo * h / mu * h_function(one, albedo, k) / (p + 1.0)
+    steep, less, more = (
+        0.25 * albedo * h / mu * h_function(exit * one, albedo, k) / (p + exit)
+        for exit in (1.0, 0.998, 1.002)
+    )
     found = Slab(albedo).aslant(np.array([k]), mu[:, 0], azimuth)[:, 0]
-    np.testing.assert_allclose(found, [everything, steep], atol=1e-6 * np.abs(everything).max())
+    np.testing.assert_allclose(found[:2], [everything, steep], atol=1e-6 * np.abs(everything).max())
+    deep = (less - more) / 0.004
+    np.testing.assert_allclose(found[2], deep, atol=2e-5 * np.abs(deep).max())
 
 
 @pytest.mark.parametrize(
@@ -78,7 +83,7 @@ def test_beams_from_all_sides_are_lambertian_light(layer: Slab) -> None:
     node, weight = cosines()
     azimuth = 2.0 * np.pi * (np.arange(64) + 0.5) / 64
     k = np.array([0.0, 0.3, 2.0])
-    everything, steep = (layer.aslant(k, node, azimuth).mean(axis=3) * 2.0 * node * weight).sum(axis=2)
+    everything, steep, _ = (layer.aslant(k, node, azimuth).mean(axis=3) * 2.0 * node * weight).sum(axis=2)
     np.testing.assert_allclose(everything, layer.reflectance(k), rtol=1e-6)
     assert steep[0] == pytest.approx(layer.plane_albedo(np.ones(1))[0], rel=1e-6)  # by reciprocity
 

@@ -1,6 +1,8 @@
 """The standard picture against the reference, which follows every ray through guide and tissue.
 
 Pictures of 96 x 61 pixels, each 8 x 8 of the paper's camera: all that is compared are means over more.
+Sensors and presses are alike in their four quarters, so pictures are folded, which halves their noise.
+Standard pictures are noisy, too: 0.6 % in a millimetre at the rim.
 """
 
 from __future__ import annotations
@@ -27,7 +29,10 @@ CASES = {
 PASSES, PATHS = 12, 2**20
 """Reference pictures and their light paths per LED."""
 
-BLOB, BACKGROUND = (26, 35, 44, 52), (26, 35, 17, 25)
+STANDARD = 8
+"""Standard pictures."""
+
+BLOB, BACKGROUND = (26, 31, 44, 48), (26, 31, 17, 25)
 BIN = 2
 
 
@@ -37,27 +42,33 @@ def _with_skin(coupling: str, **changes: object) -> Sensor:
 
 
 @cache
-def pictures(name: str, passes: int = PASSES, paths: int = PATHS) -> tuple[np.ndarray, np.ndarray]:
-    """Standard picture (rows, columns) and reference pictures (passes, rows, columns), all LEDs together."""
+def pictures(
+    name: str, passes: int = PASSES, paths: int = PATHS, standard: int = STANDARD
+) -> tuple[np.ndarray, np.ndarray]:
+    """Standard and reference pictures (passes, 31, 48), all LEDs together, folded: upper left quarters."""
     from scenes import Renderer
 
     renderer, press = Renderer(CASES[name](), "cpu"), domed() if name.startswith("domed") else bump()
-    standard = [
-        renderer.render(press, quality="standard", seed=k).radiance.sum(axis=0, dtype=np.float64)
-        for k in (1, 2)
-    ]
-    runs = [
-        renderer.render(press, quality="reference", seed=100 + k, samples=paths).radiance.sum(axis=0)
-        for k in range(passes)
-    ]
-    return np.mean(standard, axis=0), np.array(runs, dtype=np.float64)
+
+    def taken(quality: str, seed: int, samples: int | None = None) -> np.ndarray:
+        found = renderer.render(press, quality=quality, seed=seed, samples=samples)  # type: ignore[arg-type]
+        whole = found.radiance.sum(axis=0, dtype=np.float64)
+        return 0.25 * sum(whole[::up, ::along] for up in (1, -1) for along in (1, -1))[:31, :48]
+
+    return (
+        np.array([taken("standard", k) for k in range(standard)]),
+        np.array([taken("reference", 100 + k, paths) for k in range(passes)]),
+    )
 
 
-def compared(standard: np.ndarray, runs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Relative difference, per cent, of standard and reference, and its standard error; over the leading
-    axis the reference is averaged."""
-    mean, error = runs.mean(axis=0), runs.std(axis=0, ddof=1) / np.sqrt(len(runs))
-    return 100 * (standard / mean - 1), 100 * error / mean
+def compared(standard: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Relative difference, per cent, of the means over the leading axes, and its standard error."""
+    means = [runs.mean(axis=0) for runs in (standard, reference)]
+    errors = [
+        runs.std(axis=0, ddof=1) / np.sqrt(len(runs)) / mean
+        for runs, mean in zip((standard, reference), means, strict=True)
+    ]
+    return 100 * (means[0] / means[1] - 1), 100 * np.hypot(*errors)
 
 
 def crop(picture: np.ndarray, where: tuple[int, int, int, int]) -> np.ndarray:
@@ -66,24 +77,25 @@ def crop(picture: np.ndarray, where: tuple[int, int, int, int]) -> np.ndarray:
 
 
 def binned(picture: np.ndarray) -> np.ndarray:
+    """Bins of 16 x 16 pixels of the camera, (15, 24); the middle row is left out."""
     rows, columns = (size // BIN for size in picture.shape[-2:])
     part = picture[..., : rows * BIN, : columns * BIN]
     return np.asarray(part.reshape(*picture.shape[:-2], rows, BIN, columns, BIN).mean(axis=(-3, -1)))
 
 
 def profile(picture: np.ndarray) -> np.ndarray:
-    """Along the middle, a millimetre each, (24,)."""
+    """Along the middle, a millimetre each, from the rim inwards, (12,)."""
     line = picture[..., BLOB[0] : BLOB[1], :].mean(axis=-2)
-    return np.asarray(line.reshape(*line.shape[:-1], 24, 4).mean(axis=-1))
+    return np.asarray(line.reshape(*line.shape[:-1], 12, 4).mean(axis=-1))
 
 
 @pytest.mark.parametrize("name", ["air", "embedded, full contact"])
 def test_all_light_and_that_of_the_rim_are_the_references(variant: str, name: str) -> None:
     """All of it within 0.5 %, and within 4 % what is seen of the outermost millimetre, where light goes over
     the rim."""
-    standard, runs = pictures(name, 4, 2**17)
+    standard, runs = pictures(name, 4, 2**17, 3)
     for what, off, error, allowed in (
-        ("all", *compared(standard.mean(), runs.mean(axis=(1, 2))), 0.5),
+        ("all", *compared(standard.mean(axis=(1, 2)), runs.mean(axis=(1, 2))), 0.5),
         ("rim", *compared(_rim(standard), _rim(runs)), 4.0),
     ):
         print(f"{name}, {what}: {off:+.2f} ± {error:.2f} %")
@@ -92,7 +104,7 @@ def test_all_light_and_that_of_the_rim_are_the_references(variant: str, name: st
 
 def _rim(picture: np.ndarray) -> np.ndarray:
     columns = round(COARSE["columns"] / (2 * HALF_MM))
-    return np.asarray((picture[..., :columns] + picture[..., -columns:]).mean(axis=(-2, -1)))
+    return np.asarray(picture[..., :columns].mean(axis=(-2, -1)))
 
 
 @pytest.mark.slow
@@ -130,7 +142,6 @@ def test_bins_are_the_references(variant: str, name: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-@pytest.mark.xfail(strict=True, raises=AssertionError, reason="1 to 3 % off in the outer 3 mm, goal 0.5 %")
 @pytest.mark.parametrize("name", CASES)
 def test_a_profile_is_the_references(variant: str, name: str) -> None:
     """Each millimetre along the middle within 0.5 %."""
