@@ -21,6 +21,7 @@ from scenes.skin import Sheet
 
 COARSE = {"columns": 96, "rows": 61, "pixel_um": (67.2, 78.4)}
 BLOB, BACKGROUND = (slice(26, 35), slice(44, 52)), (slice(26, 35), slice(17, 25))
+BESIDE = (slice(26, 35), slice(0, 8))  # 2 mm before the LED at -x
 SPOT = slice(42, 58)  # 4 mm of the contact surface, in cells
 
 
@@ -30,6 +31,8 @@ def sensor(case: str) -> Sensor:
     base = paper_sensor(coupling if coupling == "embedded" else "air", **COARSE)
     if what == "black walls":
         return dataclasses.replace(base, guide=dataclasses.replace(base.guide, walls="absorbing"))
+    if what == "tissue 1.36":
+        return dataclasses.replace(base, tissue=dataclasses.replace(base.tissue, refractive_index=1.36))
     sheet = Sheet(thickness_mm=0.5, modulus_kPa=100.0)
     skins = {
         "full contact": {"contact": "full"},
@@ -57,6 +60,7 @@ def main() -> None:
         for name, (plain, polarised) in {
             "blob": picture[:, *BLOB].mean(axis=(1, 2)),
             "background": picture[:, *BACKGROUND].mean(axis=(1, 2)),
+            "beside an LED": picture[:, *BESIDE].mean(axis=(1, 2)),
             "picture": picture.mean(axis=(1, 2)),
             "blob over background": picture[:, *BLOB].mean(axis=(1, 2))
             / picture[:, *BACKGROUND].mean(axis=(1, 2)),
@@ -64,7 +68,7 @@ def main() -> None:
             "faces before the camera, corner": faces[:, :6, :6].mean(axis=(1, 2)),
             "entering, under the blob": entered[:, SPOT, SPOT].sum(axis=(1, 2)),
             "entering, all": entered.sum(axis=(1, 2)),
-            "entering, beside the LED at -y": entered[:, :10].sum(axis=(1, 2)),
+            "entering, 2.5 mm beside the LED at -y": entered[:, :10].sum(axis=(1, 2)),
         }.items():
             off.setdefault(name, []).append(float(100.0 * (plain / polarised - 1.0)))
     table = {name: (np.mean(one), np.std(one, ddof=1) / np.sqrt(passes)) for name, one in off.items()}
