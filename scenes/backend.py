@@ -15,6 +15,9 @@ from scenes import llvm
 VARIANTS = {"cuda": "cuda_ad_mono", "cpu": "llvm_ad_mono"}
 """Mitsuba's variant for each device: one wavelength at a time, differentiable."""
 
+POLARISED = {device: f"{variant}_polarized" for device, variant in VARIANTS.items()}
+"""The same, in which light has a state of polarisation."""
+
 
 class BackendError(ValueError):
     """Mitsuba cannot run on what was asked for; the message is one line and says what to do."""
@@ -38,11 +41,21 @@ def use(device: str = "auto") -> str:
     BackendError
         Unknown device; no GPU for "cuda"; no usable LLVM for the CPU; another variant is active already.
     """
-    if device not in ("auto", *VARIANTS):
+    return _settle(device, VARIANTS)
+
+
+def use_polarised(device: str = "auto") -> str:
+    """Make Mitsuba's polarised variant ready, as `use` does the plain one: for a process that only compares
+    the two kinds of light (`polarised`), since everything else refuses to run in it."""
+    return _settle(device, POLARISED)
+
+
+def _settle(device: str, variants: dict[str, str]) -> str:
+    if device not in ("auto", *variants):
         raise BackendError(f"device: received {device!r}; allowed: 'auto', 'cpu', 'cuda'")
     active = _active()
     if active:
-        if active not in VARIANTS.values() or device not in ("auto", _device(active)):
+        if active not in variants.values() or device not in ("auto", _device(active, variants)):
             raise BackendError(
                 f"device: received {device!r}, but this process already runs Mitsuba's {active}; "
                 "start a new process to change it"
@@ -53,17 +66,17 @@ def use(device: str = "auto") -> str:
     if not library.fault:
         os.environ["DRJIT_LIBLLVM_PATH"] = str(library.path)
     if device != "cpu":
-        fault = _cuda_fault() or _activate("cuda")
+        fault = _cuda_fault() or _activate(variants["cuda"])
         if not fault:
-            return VARIANTS["cuda"]
+            return variants["cuda"]
         if device == "cuda":
             raise BackendError(f"device: received 'cuda', but {fault}; allowed here: 'auto', 'cpu'")
     if library.fault:
         raise BackendError(f"device: no usable LLVM for Mitsuba on the CPU ({library.fault}); {llvm.ADVICE}")
-    fault = _activate("cpu")
+    fault = _activate(variants["cpu"])
     if fault:
         raise BackendError(f"device: Mitsuba does not start on the CPU ({fault}); {llvm.ADVICE}")
-    return VARIANTS["cpu"]
+    return variants["cpu"]
 
 
 def threads(count: int) -> None:
@@ -75,7 +88,7 @@ def threads(count: int) -> None:
     drjit.set_thread_count(count)
 
 
-def _activate(device: str) -> str:
+def _activate(variant: str) -> str:
     """Import Mitsuba and set its variant; returns what went wrong, in one line, or nothing."""
     fault = llvm.load_atomic()
     if fault:
@@ -83,7 +96,7 @@ def _activate(device: str) -> str:
     try:
         import mitsuba
 
-        mitsuba.set_variant(VARIANTS[device])
+        mitsuba.set_variant(variant)
     except (ImportError, RuntimeError) as error:
         return str(error).strip().splitlines()[0].rstrip(".")
     return ""
@@ -96,8 +109,8 @@ def _active() -> str | None:
     return str(variant) if variant else None
 
 
-def _device(variant: str) -> str:
-    return next(device for device, name in VARIANTS.items() if name == variant)
+def _device(variant: str, variants: dict[str, str]) -> str:
+    return next(device for device, name in variants.items() if name == variant)
 
 
 def _cuda_fault() -> str:

@@ -148,14 +148,19 @@ def _far_apart(n1: float, n0: float, n3: float, cosine: Array, wavelength_nm: fl
 def _tunnel_mean(
     n1: float, n0: float, n3: float, mean_um: Array, cosine: Array, wavelength_nm: float
 ) -> Array:
-    """The mean beyond the critical angle, where T falls steadily: Gauss-Legendre panels, wider with g."""
+    """The mean beyond the critical angle, where T falls steadily."""
+    gap, width = tunnel_nodes(mean_um)
+    density = np.exp(-gap / mean_um[:, None]) / mean_um[:, None] * width
+    return np.asarray(density @ _unpolarised(n1, n0, n3, gap, cosine, wavelength_nm))
+
+
+def tunnel_nodes(mean_um: Array) -> tuple[Array, Array]:
+    """Gaps, µm, and their weights for means over all of `mean_um`: Gauss-Legendre panels, wider with g."""
     first = min(0.01, 0.02 * mean_um.min())  # µm; T itself falls within 0.1 µm
     edges = np.concatenate([[0.0], np.geomspace(first, 40.0 * mean_um.max(), 140)])
     node, weight = np.polynomial.legendre.leggauss(5)
     half = 0.5 * np.diff(edges)
-    gap = (edges[:-1, None] + half[:, None] * (1.0 + node)).ravel()
-    density = np.exp(-gap / mean_um[:, None]) / mean_um[:, None] * (half[:, None] * weight).ravel()
-    return np.asarray(density @ _unpolarised(n1, n0, n3, gap, cosine, wavelength_nm))
+    return (edges[:-1, None] + half[:, None] * (1.0 + node)).ravel(), (half[:, None] * weight).ravel()
 
 
 def _fringe_mean(
@@ -177,7 +182,7 @@ def _fringe_mean(
         (n1**4 * w - n0**4 * q1**2) * (n3**4 * w - n0**4 * q3**2) / n0**4,
     )
     phase = 2e3 * np.pi * np.sqrt(w) / wavelength_nm * mean_um[:, None]  # k m
-    phi, weight = _quarter_turn()
+    phi, weight = quarter_turn()
     total = np.zeros(phase.shape)
     for numerator, c, d_times_w in (s_wave, p_wave):
         c_plus_d = c + d_times_w / w
@@ -189,7 +194,7 @@ def _fringe_mean(
     return np.asarray(total / phase / -np.expm1(-np.pi / phase))
 
 
-def _quarter_turn(half_count: int = 30, reach: float = 3.2) -> tuple[Array, Array]:
+def quarter_turn(half_count: int = 30, reach: float = 3.2) -> tuple[Array, Array]:
     """Double-exponential nodes and weights on 0..pi/2 (Takahasi & Mori 1974; key takahasi1974)."""
     t = np.linspace(-reach, reach, 2 * half_count + 1)
     u = 0.5 * np.pi * np.sinh(t)

@@ -115,10 +115,13 @@ class Faces:
         t, cosine = dr.select(valid, found.t, 0.0), -dr.dot(ray.d, normal)
         return Meeting(kind, found.shape, ray.d, t, p, n, normal, cosine, fraction)
 
+    def eta(self, meeting: Meeting) -> mi.Float:
+        """Index inside over that outside, as `mi.fresnel` takes it."""
+        return dr.gather(mi.Float, self._eta, meeting.kind)
+
     def polished(self, meeting: Meeting, sample: mi.Float) -> mi.Vector3f:
         """Direction after a flat dielectric face: mirrored with Fresnel's share as chance, else refracted."""
-        eta = dr.gather(mi.Float, self._eta, meeting.kind)
-        mirrored, cosine, _, squeeze = mi.fresnel(meeting.cosine, eta)
+        mirrored, cosine, _, squeeze = mi.fresnel(meeting.cosine, self.eta(meeting))
         along = meeting.d + meeting.cosine * meeting.normal
         return dr.select(sample <= mirrored, meeting.mirrored, squeeze * along + cosine * meeting.normal)
 

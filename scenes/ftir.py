@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
 
 
 def gap_transmittance(
@@ -59,7 +60,7 @@ def gap_transmittance(
         "wavelength_nm": wavelength_nm,
     }
     arrays = {name: np.asarray(value, dtype=np.float64) for name, value in values.items()}
-    _check(arrays)
+    _check(arrays, "gap_transmittance")
     i1, i0, i3, gap, cos1, wavelength = np.broadcast_arrays(*arrays.values())
 
     k2 = i1**2 * (1.0 - cos1**2)  # squared tangential index, conserved through the stack
@@ -80,6 +81,55 @@ def gap_transmittance(
     return np.where(open_, t_s, 0.0), np.where(open_, t_p, 0.0)
 
 
+def gap_reflection(
+    n1: ArrayLike,
+    n0: ArrayLike,
+    n3: ArrayLike,
+    gap_um: ArrayLike,
+    cos_theta: ArrayLike,
+    wavelength_nm: ArrayLike,
+) -> tuple[Complexes, Complexes]:
+    """Complex amplitudes r_s, r_p that the gap of `gap_transmittance` reflects, for waves exp(-i omega t).
+
+    From the characteristic matrix of the gap (Yeh 1988, ch. 5; key yeh1988): with x = a sqrt(w),
+    z_j = q_j for s and q_j / n_j² for p, q_j with a positive imaginary part beyond the critical angle,
+
+        r = (z1 B - C) / (z1 B + C),   B = cos x - i (z3/z0) sin x,   C = z3 cos x - i z0 sin x.
+
+    r_p is that of the magnetic field: -r_s at normal incidence. |r|² is 1 - T of `gap_transmittance`.
+    Arguments and errors are those of it; complex arrays of the broadcast shape.
+    """
+    values = {
+        "n1": n1,
+        "n0": n0,
+        "n3": n3,
+        "gap_um": gap_um,
+        "cos_theta": cos_theta,
+        "wavelength_nm": wavelength_nm,
+    }
+    arrays = {name: np.asarray(value, dtype=np.float64) for name, value in values.items()}
+    _check(arrays, "gap_reflection")
+    i1, i0, i3, gap, cos1, wavelength = np.broadcast_arrays(*arrays.values())
+
+    k2 = i1**2 * (1.0 - cos1**2)
+    w, q1, q3 = i0**2 - k2, i1 * cos1, np.sqrt((i3**2 - k2).astype(complex))
+    a = 2e3 * np.pi * gap / wavelength
+    x = a * np.sqrt(np.abs(w))
+    x_capped = np.minimum(x, 300.0)  # nothing tunnels beyond: the ratio no longer changes
+    waves, safe = w > 0.0, np.where(x > 1e-8, x, 1.0)
+    cosine = np.where(waves, np.cos(x), np.cosh(x_capped))
+    # sin(x) / q0 and q0 sin(x), real on both sides of the critical angle
+    ratio = np.where(x > 1e-8, np.where(waves, np.sin(x) / safe, np.sinh(x_capped) / safe), 1.0)
+    over, times = a * ratio, a * ratio * w
+
+    def reflected(z1: Complexes, z3: Complexes, squared: Array | float) -> Complexes:
+        b = cosine - 1j * z3 * over * squared
+        c = z3 * cosine - 1j * times / squared
+        return np.asarray((z1 * b - c) / (z1 * b + c))
+
+    return reflected(q1 + 0j, q3, 1.0), reflected(q1 / i1**2 + 0j, q3 / i3**2, i0**2)
+
+
 def _sine_squared_over(w: Array, a: Array) -> Array:
     """S² = sin²(a sqrt(w)) / w, continued through w = 0 (a²) into sinh²(a sqrt(-w)) / (-w)."""
     x = a * np.sqrt(np.abs(w))
@@ -89,7 +139,7 @@ def _sine_squared_over(w: Array, a: Array) -> Array:
     return a**2 * np.where(x > 1e-8, ratio, 1.0) ** 2
 
 
-def _check(arrays: dict[str, Array]) -> None:
+def _check(arrays: dict[str, Array], law: str) -> None:
     allowed = {
         "n1": (1.0, np.inf),
         "n0": (1.0, np.inf),
@@ -102,6 +152,4 @@ def _check(arrays: dict[str, Array]) -> None:
         bad = ~((arrays[name] >= low) & (arrays[name] <= high) & np.isfinite(arrays[name]))
         if np.any(bad):
             received = arrays[name][bad].flat[0]
-            raise ValueError(
-                f"gap_transmittance: {name}: received {received}; allowed {low:g} to {high:g}, finite"
-            )
+            raise ValueError(f"{law}: {name}: received {received}; allowed {low:g} to {high:g}, finite")

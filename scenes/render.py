@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from . import backend, passage, spread, surface, tissue, view
+from . import backend, surface, view
 from .sensor import NotModelled, Sensor
 
 if TYPE_CHECKING:
@@ -96,13 +96,8 @@ class Renderer:
         with threadpool_limits(1):  # linear algebra on several threads sums in another order
             optics = build.optics_of(sensor)
             coupling = build.coupling_of(sensor, optics)
-            _, body = tissue.body_behind(sensor.skin, sensor.tissue)
-            cells, margin, width = transport.GRID, transport.MARGIN, sensor.guide.width_mm
-            first = passage.passage(coupling, width, cells, margin)
-            wide = cells + 2 * margin
-            spreads = spread.spreader(body, coupling, width * wide / cells, wide)
+            self.behind = transport.Behind.of(sensor, coupling)
             self.basis = angular_basis(optics, coupling)
-        self.behind = transport.Behind(coupling, first, spreads)
         self.packed = Table.pack(optics, coupling)
         self.table = Table(self.packed)
         self.scene = build.load_scene(sensor, self.packed)

@@ -199,6 +199,35 @@ def re_emit(
     Even over the guide's face, directions as T(cos) cos, weight as L = (n1/n3)² T sum phi_i(cos) V_i / pi;
     `upward` is V (n_led, modes, m, m), W/mm², on cells [iy, ix] of the guide's face.
     """
+    left = depart(scene, sensor, table, u)
+    n_led, modes = upward.shape[:2]
+    layers = look_up(upward.reshape(n_led * modes, *upward.shape[2:]), u[0], u[1])
+    lobes = table.lobes(left.cosine, left.meets)
+    brightness = mi.Float(0.0)
+    for led in range(n_led):
+        here = sum(lobe * layers[led * modes + i] for i, lobe in enumerate(lobes))
+        brightness = dr.select(number == led, here, brightness)
+    width, cosine = sensor.guide.width_mm, left.cosine
+    lobe = coupling.scale * width**2 * table.transmittance(left.fraction, cosine, left.meets)
+    lobe = lobe * cosine * dr.inv_pi
+    brightness *= lobe / table.density(left.fraction, cosine, left.meets)
+    return left.ray, dr.select(left.meets, dr.maximum(brightness, 0.0), 0.0)
+
+
+@dataclass(frozen=True)
+class Departure:
+    """Rays that leave the contact surface: whether it `meets` the place at all, contact fraction, cosine and
+    normal there, and the ray."""
+
+    meets: mi.Bool
+    fraction: mi.Float
+    cosine: mi.Float
+    normal: mi.Vector3f
+    ray: mi.Ray3f
+
+
+def depart(scene: mi.Scene, sensor: Sensor, table: Table, u: list[mi.Float]) -> Departure:
+    """Rays even over the guide's face, in directions as T(cos) cos, of points of the unit 4-cube."""
     width = sensor.guide.width_mm
     x, y = (u[0] - 0.5) * width, (u[1] - 0.5) * width
     below = mi.Ray3f(mi.Point3f(x, y, -0.25 * sensor.guide.thickness_mm), mi.Vector3f(0.0, 0.0, 1.0))
@@ -206,21 +235,12 @@ def re_emit(
     contact = next(shape for shape in scene.shapes() if shape.id() == "contact")
     meets = si.is_valid() & (si.shape == mi.ShapePtr(contact))
     fraction = dr.select(meets, contact.eval_attribute_1("vertex_contact_fraction", si, meets), 0.0)
-    n_led, modes = upward.shape[:2]
-    layers = look_up(upward.reshape(n_led * modes, *upward.shape[2:]), u[0], u[1])
 
     # which of the table's two rows to draw from needs no even spread: any digits of the place will do
     digits = u[0] * 4096.0
     direction = table.draw(fraction, digits - dr.floor(digits), mi.Point2f(u[2], u[3]), meets)
     cosine = mi.Frame3f.cos_theta(direction)
-    lobes = table.lobes(cosine, meets)
-    brightness = mi.Float(0.0)
-    for led in range(n_led):
-        here = sum(lobe * layers[led * modes + i] for i, lobe in enumerate(lobes))
-        brightness = dr.select(number == led, here, brightness)
-    lobe = coupling.scale * width**2 * table.transmittance(fraction, cosine, meets) * cosine * dr.inv_pi
-    brightness *= lobe / table.density(fraction, cosine, meets)
-    return si.spawn_ray(si.to_world(direction)), dr.select(meets, dr.maximum(brightness, 0.0), 0.0)
+    return Departure(meets, fraction, cosine, si.sh_frame.n, si.spawn_ray(si.to_world(direction)))
 
 
 def side_by_side(each: int, n_led: int) -> mi.UInt32:
@@ -278,24 +298,24 @@ def bounce_off(
     clear = (met.kind == TO_GLASS) | (met.kind == TO_AIR) | (met.kind == WALL)
     share = dr.select(active & clear, 1.0, 0.0)
     if sensor.guide.walls != "polished":
-        painted = _painted(sensor, met, active)
+        coated = painted(sensor, met, active)
         albedo = sensor.guide.wall_albedo if sensor.guide.walls == "diffuse" else 0.0
         back = mi.warp.square_to_cosine_hemisphere(sample2)
         back = mi.Frame3f(met.normal).to_world(mi.Vector3f(back.x, back.y, -back.z))
-        share = dr.select(painted, dr.select(met.cosine < 0.0, albedo, 0.0), share)
-        direction = dr.select(painted, back, direction)
+        share = dr.select(coated, dr.select(met.cosine < 0.0, albedo, 0.0), share)
+        direction = dr.select(coated, back, direction)
     return direction, share
 
 
-def _painted(sensor: Sensor, met: Meeting, active: mi.Bool) -> mi.Bool:
+def painted(sensor: Sensor, met: Meeting, active: mi.Bool) -> mi.Bool:
     """Where walls are painted: all over, but for the windows before LEDs in air."""
-    half, painted = sensor.guide.width_mm / 2, active & (met.kind == WALL)
+    half, found = sensor.guide.width_mm / 2, active & (met.kind == WALL)
     for led in sensor.leds:
         if led.coupling == "air" and led.side != "below":
             centre, axis, _ = led_frame(led, half)
             middle = mi.Point3f(*(centre + led.gap_mm * axis).tolist())
-            painted = painted & (dr.squared_norm(met.p - middle) > led.window_mm**2)
-    return painted
+            found = found & (dr.squared_norm(met.p - middle) > led.window_mm**2)
+    return found
 
 
 def _next_leg(leg: mi.UInt32, kind: mi.UInt32, passed: mi.Bool) -> mi.UInt32:

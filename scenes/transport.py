@@ -17,10 +17,10 @@ from .abreast import abreast
 from .bsdf import Table
 from .gather import meet
 from .irradiance import AngularBasis, Entrance, smooth, transmitted
-from .passage import Face, Passage, Seen
+from .passage import Face, Passage, Seen, passage
 from .sensor import Led, Sensor
-from .spread import Bed, Spread
-from .tissue import Coupling
+from .spread import Bed, Spread, spreader
+from .tissue import Coupling, body_behind
 
 Array = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -39,6 +39,14 @@ class Behind:
     coupling: Coupling
     passage: Passage
     spread: Spread
+
+    @staticmethod
+    def of(sensor: Sensor, coupling: Coupling) -> Behind:
+        """Behind this sensor's contact."""
+        _, body = body_behind(sensor.skin, sensor.tissue)
+        width, wide = sensor.guide.width_mm, GRID + 2 * MARGIN
+        first = passage(coupling, width, GRID, MARGIN)
+        return Behind(coupling, first, spreader(body, coupling, width * wide / GRID, wide))
 
 
 @dataclass(frozen=True)

@@ -147,17 +147,36 @@ def faces_reflectance(sensor: Sensor, cosine: Array) -> Array:
     n1, n2 = sensor.guide.refractive_index, sensor.glass.refractive_index
     sine = n1 * np.sqrt(1.0 - np.asarray(cosine) ** 2)
     first, second = _fresnel(n1, n2, sine), _fresnel(n2, 1.0, sine)
+    return _both_faces(first, second)
+
+
+def faces_reflectances(sensor: Sensor, cosine: Array) -> tuple[Array, Array]:
+    """`faces_reflectance` of s and of p polarised light."""
+    n1, n2 = sensor.guide.refractive_index, sensor.glass.refractive_index
+    sine = n1 * np.sqrt(1.0 - np.asarray(cosine) ** 2)
+    faces = zip(_fresnel_apart(n1, n2, sine), _fresnel_apart(n2, 1.0, sine), strict=True)
+    s, p = (_both_faces(*pair) for pair in faces)
+    return s, p
+
+
+def _both_faces(first: Array, second: Array) -> Array:
     passes = 1.0 - first * second  # 0 where the first face reflects all already
     return np.asarray(first + (1.0 - first) ** 2 * second / np.where(passes > 0.0, passes, 1.0))
 
 
 def _fresnel(n_in: float, n_out: float, n_sine: Array) -> Array:
     """Unpolarised Fresnel reflectance at tangential index n sin(theta) (Born & Wolf 1999; key born1999)."""
+    s, p = _fresnel_apart(n_in, n_out, n_sine)
+    return np.asarray(np.where(n_sine < n_out, 0.5 * (s + p), 1.0))
+
+
+def _fresnel_apart(n_in: float, n_out: float, n_sine: Array) -> tuple[Array, Array]:
+    """The same of s and p, 1 beyond the critical angle."""
     a = np.sqrt(np.maximum(n_in**2 - n_sine**2, 0.0))
     b = np.sqrt(np.maximum(n_out**2 - n_sine**2, 0.0))
     s = (a - b) / np.maximum(a + b, 1e-300)
     p = (n_out**2 * a - n_in**2 * b) / np.maximum(n_out**2 * a + n_in**2 * b, 1e-300)
-    return np.asarray(np.where(n_sine < n_out, 0.5 * (s**2 + p**2), 1.0))
+    return np.where(n_sine < n_out, s**2, 1.0), np.where(n_sine < n_out, p**2, 1.0)
 
 
 def _refract(in_air: Array, index: float) -> Array:
