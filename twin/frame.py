@@ -93,6 +93,8 @@ class Frame:
         if self.inclusion is not None:
             units = {"size": "size_mm", "depth": "depth_mm", "modulus": "modulus_kPa", "offset": "offset_mm"}
             inclusion = {units.get(key, key): value for key, value in asdict(self.inclusion).items()}
+            if self.design.specimen.inclusion is not None:
+                inclusion["optics"] = asdict(self.design.specimen.inclusion.of(self.design.tissue()))
         return {
             "inclusion": inclusion,
             "press": self.press,

@@ -19,6 +19,7 @@ from scipy.stats import qmc
 import fem
 from twin import presses
 from twin.complaint import DesignError, shown
+from twin.conflicts import colourless
 from twin.design import Design, parse_design
 from twin.fields import put, tables_of
 from twin.pooled import each
@@ -74,6 +75,7 @@ def learn_light(
     from scenes import spectral, traced
 
     target = check_file(out, "out", ".npz")
+    colourless(design, "learned light")
     if samples < 64:
         raise DesignError("samples", shown(samples), "64 or more")
     file = Path(emulator) if emulator is not None else presses.EMULATORS / f"{design.name}.npz"
