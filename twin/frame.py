@@ -80,7 +80,7 @@ class Frame:
     tsis: dict[str, Any] = field(default_factory=dict)
     """Scalars ``raw`` and ``tared`` of the picture, ``saturated_percent``, ``frames`` and
     ``reference_frames`` (exposures that picture and reference are the mean of), ``seconds``,
-    ``noise_percent``."""
+    ``noise_percent``, ``bias_percent`` and ``bias_of`` (`twin.light_bias`)."""
 
     @property
     def tared(self) -> NDArray[np.float32]:

@@ -25,6 +25,7 @@ from twin.exposure import (
     take_reference,
 )
 from twin.frame import Frame
+from twin.light_bias import bias_of
 from twin.presses import Mechanics, Quality
 
 if TYPE_CHECKING:
@@ -280,5 +281,6 @@ def _frame(
             "reference_frames": reference_frames(design),
             "seconds": time.perf_counter() - start,
             "noise_percent": lit.noise_percent,
+            **bias_of(design, options["quality"], learned=options["traced"] is not None),
         },
     )
