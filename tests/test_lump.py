@@ -43,15 +43,20 @@ def picture(colour: Colour, place: Place | None, paths: int, seed: int = 5) -> n
     return np.asarray(found.radiance, np.float64)
 
 
-def test_a_lump_of_the_tissues_own_optics_changes_no_bit(variant: str) -> None:
-    assert np.array_equal(picture(Colour(), ball(0.5), 2**13), picture(Colour(), None, 2**13))
+def test_a_lump_of_the_tissues_own_optics_changes_no_bit_and_a_dark_one_darkens(variant: str) -> None:
+    own, plain = (picture(Colour(), place, 2**13) for place in (ball(0.5), None))
+    assert np.array_equal(own, plain)
+    middle = (slice(None), *MIDDLE)
+    assert picture(DARK, ball(0.5), 2**13)[middle].sum() < 0.85 * plain[middle].sum()
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
 def test_a_dark_lump_close_below_darkens_the_middle_and_a_deep_one_does_not(variant: str) -> None:
     """4 mm wide with its top 0.5 mm deep, and 12 mm deep, three times as far as light reaches."""
     means = {}
     for name, place in (("plain", None), ("close", ball(0.5)), ("deep", ball(12.0))):
-        runs = [picture(DARK, place, 2**14, seed).sum(axis=0)[MIDDLE].mean() for seed in (1, 2, 3)]
+        runs = [picture(DARK, place, 2**16, seed).sum(axis=0)[MIDDLE].mean() for seed in (1, 2, 3)]
         means[name] = np.mean(runs), np.std(runs, ddof=1) / np.sqrt(len(runs))
     print({name: f"{mean:.4g} ± {error:.2g}" for name, (mean, error) in means.items()})
     (mean, error), (close, _), (deep, other) = (means[name] for name in ("plain", "close", "deep"))
