@@ -12,6 +12,7 @@ import pyvista as pv
 from numpy.typing import NDArray
 
 from fem import mesh, surface, volume
+from fem.carried import carried
 from fem.equilibrium import NotConverged as Stuck
 from fem.equilibrium import State
 from fem.mesh import Geometry
@@ -83,6 +84,10 @@ class Press:
     error_percent: float
     _states: tuple[State, State] = field(repr=False)
     _geometry: Geometry = field(repr=False)
+
+    def inclusion(self) -> tuple[Floats, Floats] | None:
+        """The deformed inclusion as an ellipsoid, centre (3,) and axes (3, 3) in mm; see `fem.carried`."""
+        return None if self._geometry.inclusion is None else carried(self._geometry, self._states[0])
 
     def volume(self) -> pv.UnstructuredGrid:
         """Displacement, material, modulus and stress throughout probe and slab; see `fem.volume`."""

@@ -147,6 +147,7 @@ def exact(
     *,
     local: bool = False,
     slopes: Array | None = None,
+    place: tuple[Array, Array] | None = None,
 ) -> Array:
     """What the camera sees directly, and mirrored once in the lower faces, without the ways between.
 
@@ -164,6 +165,8 @@ def exact(
     slopes
         Derivatives of `fraction` to q parameters, (q, m, m): what is seen is followed by its derivatives, by
         the paths' scores (`wander.Spots`). Not with `local`.
+    place
+        Centre (3,) and axes (3, 3), mm, of an ellipsoid of `sensor.inclusion` in the tissue (`wander.Lump`).
 
     Returns
     -------
@@ -182,6 +185,7 @@ def exact(
     faces = Faces(scene, sensor)
     context = mi.BSDFContext(mi.TransportMode.Importance)
     spots = wander.Spots.of(sensor, fraction, even)
+    lump = None if place is None else wander.Lump.of(sensor, place)
     squeezed = (sensor.guide.refractive_index / sensor.tissue.refractive_index) ** 2
 
     index = dr.arange(mi.UInt32, n_led * samples)
@@ -227,7 +231,7 @@ def exact(
                 one + dr.select(touches, new, 0.0) for one, new in zip(scores, chosen, strict=True)
             )
             back, left, random, scores = wander.wander(
-                sensor, table, spots, views, met, number, throughput, enters, random, scores
+                sensor, table, spots, views, met, number, throughput, enters, random, scores, lump
             )
             share = dr.select(enters, left, share)
             following = dr.select(enters, _come_back(scene, contact, back), following)

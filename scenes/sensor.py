@@ -19,7 +19,7 @@ from .dispersion import GLASS, Glassware
 from .imager import Camera, camera_conflicts
 from .led import Led, Side, led_conflicts
 from .quantity import CONFIG, Conflict, Length, RefractiveIndex, Wavelength
-from .skin import MIN_EXTINCTION, Absorption, Skin, Tissue
+from .skin import MAX_CONTRAST, MIN_EXTINCTION, Absorption, Colour, Skin, Tissue
 
 __all__ = [
     "Camera",
@@ -107,9 +107,14 @@ class Sensor:
         ),
     ]
     wavelength_nm: Annotated[Wavelength, Field(description="Wavelength of the light, nm.")] = 550.0
+    inclusion: Annotated[
+        Colour | None, Field(description="An inclusion's own optics; only the reference quality sees it.")
+    ] = None
 
     def __post_init__(self) -> None:
-        for conflict in conflicts(self.guide, self.leds, self.camera, self.skin, self.glass):
+        found = list(conflicts(self.guide, self.leds, self.camera, self.skin, self.glass))
+        found += colour_conflicts(self.inclusion, self.tissue, self.skin)
+        for conflict in found[:1]:
             raise ValueError(f"{conflict.field}: received {conflict.received!r}; allowed {conflict.allowed}")
 
 
@@ -135,3 +140,15 @@ def conflicts(
             skin.sheet.scattering_per_mm,
             f"with the absorption at least {MIN_EXTINCTION:g} per mm (clear sheets are part of the guide)",
         )
+
+
+def colour_conflicts(colour: Colour | None, tissue: Tissue, skin: Skin) -> Iterator[Conflict]:
+    """Yield what keeps an inclusion's own optics from being walked in."""
+    if colour is None:
+        return
+    if skin.sheet is not None:
+        yield Conflict("inclusion", "it behind a contact sheet", "none: no light gets past the sheet")
+    most, own = MAX_CONTRAST * tissue.extinction_per_mm, colour.of(tissue).extinction_per_mm
+    if own > most:
+        allowed = f"µs + µa (µs = µs' / (1 - g)) up to {most:.3g} per mm, {MAX_CONTRAST:g} times the tissue's"
+        yield Conflict("inclusion", f"{own:.3g} per mm of scattering and absorption", allowed)

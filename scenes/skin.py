@@ -5,6 +5,7 @@ Lengths are mm, gaps and roughness µm, coefficients 1/mm. Every class checks it
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated, Literal
 
 from pydantic import ConfigDict, Field
@@ -22,6 +23,12 @@ Anisotropy = Annotated[float, Field(ge=-0.9, le=0.99)]
 _SCATTERING = "Reduced scattering coefficient µs' = (1 - g) µs of the {}, 1/mm."
 _ABSORPTION = "Absorption coefficient µa of the {}, 1/mm."
 _ANISOTROPY = "Mean cosine g of one scattering; only the volumetric reference uses it."
+
+_COLOUR = ("scattering_per_mm", "absorption_per_mm", "anisotropy")
+
+MAX_CONTRAST = 20.0
+"""Largest extinction µs + µa (µs not reduced) of an inclusion, over the tissue's: free paths everywhere are
+drawn for the denser of the two (`walk.roam`), and take that much longer."""
 
 MIN_EXTINCTION = 0.01
 """Least scattering and absorption together of a contact sheet, 1/mm."""
@@ -107,6 +114,26 @@ class Skin:
 
 
 @dataclass(frozen=True, config=CONFIG)
+class Colour:
+    """An inclusion's own optics; what is left out is the tissue's, as its refractive index always is."""
+
+    scattering_per_mm: Annotated[
+        Scattering | None, Field(description=_SCATTERING.format("inclusion; the tissue's if left out"))
+    ] = None
+    absorption_per_mm: Annotated[
+        Absorption | None, Field(description=_ABSORPTION.format("inclusion; the tissue's if left out"))
+    ] = None
+    anisotropy: Annotated[
+        Anisotropy | None, Field(description="Mean cosine g of one scattering; the tissue's if left out.")
+    ] = None
+
+    def of(self, tissue: Tissue) -> Tissue:
+        """The tissue, with this in the place of its own."""
+        own = {name: getattr(self, name) for name in _COLOUR}
+        return replace(tissue, **{name: value for name, value in own.items() if value is not None})
+
+
+@dataclass(frozen=True, config=CONFIG)
 class Tissue:
     """The specimen, as light sees it: it scatters in depth."""
 
@@ -116,3 +143,8 @@ class Tissue:
     scattering_per_mm: Annotated[Scattering, Field(description=_SCATTERING.format("tissue"))] = 1.0
     absorption_per_mm: Annotated[Absorption, Field(description=_ABSORPTION.format("tissue"))] = 0.02
     anisotropy: Annotated[Anisotropy, Field(description=_ANISOTROPY)] = 0.0
+
+    @property
+    def extinction_per_mm(self) -> float:
+        """µs + µa, 1/mm, with µs not reduced."""
+        return self.scattering_per_mm / (1.0 - self.anisotropy) + self.absorption_per_mm

@@ -36,6 +36,7 @@ class SpectralRenderer:
         count: int = 3,
         at: Callable[[float], Sensor] | None = None,
         device: str = "auto",
+        coloured: bool = False,
     ) -> None:
         """Load the scenes on `device` ("auto", "cpu" or "cuda"; see `backend.use`).
 
@@ -47,11 +48,13 @@ class SpectralRenderer:
             Number of bands of a spectrum that is no line.
         at
             The sensor at another wavelength, nm; without it the indices stay the same.
+        coloured
+            As of `Renderer`.
         """
         self.sensor, self._device = sensor, device
         parts = band_sensors(sensor, count=count, at=at)
         self.bands, self._leds = [band for band, _, _ in parts], [leds for _, leds, _ in parts]
-        self.renderers = [Renderer(one, device=device) for _, _, one in parts]
+        self.renderers = [Renderer(one, device=device, coloured=coloured) for _, _, one in parts]
 
     @cached_property
     def whole(self) -> Renderer:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -51,23 +52,39 @@ class Medium:
         return self.scattering_per_mm + self.absorption_per_mm
 
 
+class Inclusion(Protocol):
+    """A part of the body that is another medium, of the same refractive index."""
+
+    @property
+    def medium(self) -> Medium: ...
+
+    def holds(self, point: mi.Point3f) -> mi.Bool:
+        """Which points are in it."""
+
+
 @dataclass(frozen=True)
 class Ball:
-    """A sphere of another medium, of the same refractive index, below the face."""
+    """A sphere of another medium below the face."""
 
     centre_mm: tuple[float, float, float]
     radius_mm: float
     medium: Medium
 
+    def holds(self, point: mi.Point3f) -> mi.Bool:
+        """Which points are in it."""
+        centre, radius = mi.Point3f(*self.centre_mm), dr.opaque(mi.Float, self.radius_mm)
+        return dr.squared_norm(point - centre) < dr.square(radius)
+
 
 @dataclass(frozen=True)
 class Body:
-    """What light walks in: a half-space, or a slab in front of a Lambertian backing; a ball may lie in it."""
+    """What light walks in: a half-space, or a slab in front of a Lambertian backing; another medium may be in
+    it."""
 
     medium: Medium
     thickness_mm: float = np.inf
     backing: float = 0.0
-    ball: Ball | None = None
+    ball: Inclusion | None = None
 
 
 @dataclass(frozen=True)
@@ -190,7 +207,6 @@ def roam(
     bottom = dr.opaque(mi.Float, min(body.thickness_mm, 1e30))
     kept, real, g = (dr.opaque(mi.Float, v) for v in _collision(medium, majorant))
     if ball:
-        centre, radius = mi.Point3f(*ball.centre_mm), dr.opaque(mi.Float, ball.radius_mm)
         kept_in, real_in, g_in = (dr.opaque(mi.Float, v) for v in _collision(ball.medium, majorant))
     isotropic = medium.anisotropy == 0.0 and (ball is None or ball.medium.anisotropy == 0.0)
 
@@ -215,7 +231,7 @@ def roam(
 
         share, chance, mean = kept, real, g
         if ball:
-            inside = dr.squared_norm(where - centre) < dr.square(radius)
+            inside = ball.holds(where)
             share, chance, mean = (
                 dr.select(inside, a, b) for a, b in ((kept_in, kept), (real_in, real), (g_in, g))
             )

@@ -7,8 +7,8 @@ Import only after a variant is set (`scenes.backend.use`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import drjit as dr
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from .bsdf import Table
 from .faces import Meeting
 from .sensor import Sensor
+from .skin import Tissue
 from .walk import Body, Medium, Scores, fresnel, roam
 
 _LEAST = 1e-6  # of a chance that is divided by: what is rarer never happens
@@ -90,12 +91,74 @@ class Spots:
         return mi.Point2f(point.x / self.width_mm + 0.5, point.y / self.width_mm + 0.5)
 
 
+@dataclass(frozen=True)
+class Lump:
+    """An ellipsoid in the tissue with optics of its own, in the sensor's frame.
+
+    Attributes
+    ----------
+    medium
+        What it is made of.
+    centre_mm, inverse
+        Points whose `inverse` @ (point - `centre_mm`) is no longer than 1 are in it.
+    """
+
+    medium: Medium
+    centre_mm: mi.Point3f
+    inverse: mi.Matrix3f
+
+    @staticmethod
+    def of(sensor: Sensor, place: tuple[NDArray[np.float64], NDArray[np.float64]]) -> Lump | None:
+        """The inclusion at a place, centre (3,) and axes (3, 3) in mm; None where its optics are the
+        tissue's."""
+        if sensor.inclusion is None:
+            return None
+        centre, axes = place
+        middle = mi.Point3f(*(dr.opaque(mi.Float, float(part)) for part in centre))
+        rows = [[dr.opaque(mi.Float, float(one)) for one in row] for row in np.linalg.inv(axes)]
+        return Lump(medium_of(sensor.inclusion.of(sensor.tissue)), middle, mi.Matrix3f(rows))
+
+    def unit(self, point: mi.Point3f) -> mi.Vector3f:
+        """A point where the lump is the unit ball."""
+        return self.inverse @ mi.Vector3f(point - self.centre_mm)
+
+    def share(self, start: mi.Point3f, end: mi.Point3f) -> mi.Float:
+        """Share of the way from one point to another that lies in it."""
+        begin = self.unit(start)
+        way = self.unit(end) - begin
+        square = dr.maximum(dr.squared_norm(way), 1e-20)
+        middle = -dr.dot(begin, way) / square
+        half = dr.square(middle) - (dr.squared_norm(begin) - 1.0) / square
+        reach = dr.safe_sqrt(half)
+        return dr.clip(middle + reach, 0.0, 1.0) - dr.clip(middle - reach, 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Below:
+    """A lump as it lies under one point of the contact, in the frame that light walks in there."""
+
+    lump: Lump
+    world: Callable[[mi.Point3f], mi.Point3f]
+
+    @property
+    def medium(self) -> Medium:
+        return self.lump.medium
+
+    def holds(self, point: mi.Point3f) -> mi.Bool:
+        return dr.squared_norm(self.lump.unit(self.world(point))) < 1.0
+
+
+def medium_of(tissue: Tissue) -> Medium:
+    """Tissue as a medium to walk in."""
+    g = tissue.anisotropy
+    return Medium(tissue.scattering_per_mm / (1.0 - g), tissue.absorption_per_mm, g)
+
+
 def body_of(sensor: Sensor) -> Body:
     """What light enters: the tissue, or the contact sheet before it."""
-    skin, tissue = sensor.skin, sensor.tissue
-    g = tissue.anisotropy
+    skin = sensor.skin
     if skin.sheet is None:
-        return Body(Medium(tissue.scattering_per_mm / (1.0 - g), tissue.absorption_per_mm, g))
+        return Body(medium_of(sensor.tissue))
     sheet = skin.sheet
     medium = Medium(sheet.scattering_per_mm, sheet.absorption_per_mm)
     return Body(medium, sheet.thickness_mm, sheet.backing)
@@ -112,8 +175,11 @@ def wander(
     enters: mi.Bool,
     random: mi.PCG32,
     scores: Scores = (),
+    lump: Lump | None = None,
 ) -> tuple[mi.Ray3f, mi.Float, mi.PCG32, Scores]:
     """Follow light that enters where it `met` the contact until it leaves; views see every collision.
+
+    A lump lies where it is in space: only the face over it is flat.
 
     Returns
     -------
@@ -128,6 +194,11 @@ def wander(
 
     def world(place: mi.Point3f) -> mi.Point3f:
         return met.p + frame.to_world(mi.Vector3f(place.x, place.y, -place.z))
+
+    extinction, more = body.medium.extinction_per_mm, 0.0
+    if lump is not None:
+        body = replace(body, ball=Below(lump, world))
+        more = lump.medium.extinction_per_mm - extinction
 
     def steep(where: mi.Point3f, cosine: mi.Float) -> tuple[mi.Float, mi.Float]:
         square, place = 1.0 - (1.0 - dr.square(cosine)) / index**2, world(where)
@@ -156,7 +227,10 @@ def wander(
             leaves = world(where + run * mi.Vector3f(aim_x, aim_y, -up))
             through, slope = table.steep(spots.at(leaves), out.z, collides)
             bend = phase(g, dr.dot(way, mi.Vector3f(aim_x, aim_y, -up)))
-            amount = throughput * share * bend * dr.exp(-body.medium.extinction_per_mm * run) / up
+            depth = extinction * run
+            if lump is not None:
+                depth += more * run * lump.share(world(where), leaves)
+            amount = throughput * share * bend * dr.exp(-depth) / up
             # a pixel sees more of what lies deeper; its radiance is that of the area it sees at the face
             amount *= out.z * length * dr.square(1.0 - view.spread_per_mm * index * dr.maximum(where.z, 0.0))
             changes = zip(so_far, spots.derivatives(leaves), strict=True)

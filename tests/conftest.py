@@ -10,6 +10,11 @@ os.environ["MPLBACKEND"] = "Agg"
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    what = "write what tests/test_standard_quality.py measures to assets/light_bias.json"
+    parser.addoption("--write-bias", action="store_true", help=what)
+
+
 @pytest.fixture(scope="session")
 def variant() -> str:
     """Mitsuba on the CPU, which every machine has: ask for this fixture before importing mitsuba or drjit."""

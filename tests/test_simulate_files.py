@@ -70,6 +70,7 @@ def test_frame_json_has_exactly_the_promised_keys(frame, folder):
     assert (record["fem"]["path"], record["fem"]["mechanics"]) == ("tied", "linear")
     assert set(record["fem"]["raw"]) == set(record["fem"]["tared"]) == {"max_mm", "total_mm3", "area_mm2"}
     told = {"frames", "reference_frames", "seconds", "noise_percent", "saturated_percent"}
+    told |= {"bias_percent", "bias_of"}
     assert set(record["tsis"]) == {"raw", "tared", *told}
     assert (record["tsis"]["frames"], record["tsis"]["reference_frames"]) == (1, 16)
     assert set(record["tsis"]["raw"]) == set(record["tsis"]["tared"]) == {"max_dn", "total_dn", "area_px"}

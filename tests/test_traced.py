@@ -13,7 +13,10 @@ import twin
 from scenes import SpectralRenderer, traced
 from scenes.sensor import NotModelled, Sensor
 from scenes.surface import OpticalSurface
+from twin import learn_light
+from twin.complaint import DesignError
 from twin.exposure import expected_counts
+from twin.learn_light import light_of
 from twin.retake import average
 
 
@@ -113,6 +116,52 @@ def test_hostile_files_are_refused(learned, tmp_path):
         traced.save([replace(learned, **change)], place)
         with pytest.raises(NotModelled, match="no traced light"):
             traced.load(place)
+
+
+def test_files_of_an_older_format_are_refused_in_one_line(learned, tmp_path, monkeypatch):
+    place = tmp_path / "light.npz"
+    with monkeypatch.context() as older:
+        older.setattr(traced, "FORMAT", "tsis-traced-1")
+        traced.save([learned], place)
+        assert len(traced.load(place)) == 1  # it was whole in its time
+    with pytest.raises(DesignError, match=r"traced: received .*; allowed a file of") as refused:
+        light_of(place)
+    assert "\n" not in str(refused.value)
+    with pytest.raises(DesignError, match=r"traced: received .*; allowed a file of"):
+        twin.simulate(small(), None, 1.0, traced=place)
+
+
+def test_files_of_an_earlier_light_are_refused_in_one_line(sensor, tmp_path, monkeypatch):
+    """The format is today's, what it was learned of is not: pictures of the same press have changed since."""
+    surfaces, fractions, light = presses(120, 0)
+    told = [traced.describe(*one) for one in zip(surfaces, fractions, strict=True)]
+    place = tmp_path / "light.npz"
+    with monkeypatch.context() as earlier:
+        earlier.setattr(traced, "LIGHT", traced.LIGHT - 1)
+        traced.save([traced.learn(sensor, told, light)], place)
+        traced.check(light_of(place), [sensor])  # it was good in its time
+    (old,) = light_of(place)
+    for use in (
+        lambda: traced.check([old], [sensor]),
+        lambda: old.at(sensor, surfaces[0], fractions[0]),
+    ):
+        with pytest.raises(NotModelled, match=r"^traced: received light .* by an earlier version") as refused:
+            use()
+        assert "\n" not in str(refused.value)
+
+
+def test_presses_traced_for_an_earlier_light_or_another_design_are_traced_anew(tmp_path, monkeypatch):
+    task = learn_light.Task(small(), fem.Inclusion(10, 5, 100), 2.0, "", 0, False, tmp_path / "0.0000.npz")
+    arrays = {"description": np.zeros(3), "traced.0": np.zeros((1, 2, 4, 4))}
+    learn_light._write(task.place, {"mark": np.array(learn_light._mark(task)), **arrays})
+    assert learn_light._kept(task) and len(learn_light._read(task.place)[1]) == 1
+    camera = replace(task.design, name="another")
+    for other in (replace(task, depth_mm=1.0), replace(task, design=camera)):
+        assert not learn_light._kept(other)
+    monkeypatch.setattr(traced, "LIGHT", traced.LIGHT + 1)
+    assert not learn_light._kept(task)
+    np.savez(task.place, **arrays)  # of a version that left no mark
+    assert not learn_light._kept(task)
 
 
 @pytest.mark.slow

@@ -229,7 +229,7 @@ def _export(arguments: argparse.Namespace, design: Design, inclusion: fem.Inclus
     levels = arguments.indentation or design.press.indentation_mm
     for kind in export_optics.KINDS:
         if (name := getattr(arguments, kind)) is not None:
-            export_optics.check(design, inclusion, levels)
+            export_optics.check(design, inclusion, levels, kind)
             with Reporter() as report:
                 place = export_optics.export(
                     design, inclusion, levels, kind, name, quality=arguments.quality, progress=report

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from fem import Inclusion
 from fem.model import MAX_SAG, MAX_SLENDERNESS
+from scenes.sensor import colour_conflicts
 from scenes.sensor import conflicts as optical_conflicts
 from scenes.spectrum import longest
 from twin.complaint import DesignError, shown
@@ -46,6 +47,8 @@ def design_conflicts(design: Design) -> Iterator[DesignError]:
     for conflict in optical_conflicts(redmost, design.leds, design.camera, design.surface, design.glass):
         field = conflict.field.replace("skin.", "surface.")
         yield DesignError(field, shown(conflict.received), conflict.allowed)
+    for conflict in colour_conflicts(slab.inclusion, design.tissue(), design.surface):
+        yield DesignError(f"specimen.{conflict.field}", str(conflict.received), conflict.allowed)
     if slab.width_mm < design.waveguide.width_mm:
         allowed = f"at least the waveguide's width of {design.waveguide.width_mm:g} mm"
         yield DesignError("specimen.width_mm", shown(slab.width_mm), allowed)
@@ -118,3 +121,10 @@ def inclusion_conflicts(design: Design, inclusion: Inclusion) -> Iterator[Design
             f"this one is {wide:g} mm"
         )
         yield DesignError("inclusion.size", shown(inclusion.size), what)
+
+
+def colourless(design: Design, what: str) -> None:
+    """Raise `DesignError` if a design's inclusion has optics of its own, which `what` cannot show."""
+    if design.specimen.inclusion is not None:
+        allowed = f"none in {what}: only `twin simulate --quality reference` follows light below the surface"
+        raise DesignError("specimen.inclusion", "optics of its own", allowed)

@@ -25,7 +25,7 @@ from fem.model import DomeRadius, Length, Modulus, Offset, Poisson, Sides, Tilt
 from scenes import dispersion, ies
 from scenes.led import Light
 from scenes.sensor import Camera, Glass, Guide, Led, Sensor, Walls
-from scenes.skin import Absorption, Anisotropy, RefractiveIndex, Scattering, Skin, Tissue
+from scenes.skin import Absorption, Anisotropy, Colour, RefractiveIndex, Scattering, Skin, Tissue
 from twin.complaint import DesignError, from_validation, not_finite, shown
 from twin.conflicts import design_conflicts, inclusion_conflicts
 
@@ -107,6 +107,10 @@ class Specimen:
         Anisotropy,
         Field(description="Mean cosine g of one scattering; only the volumetric reference uses it."),
     ] = 0.0
+    inclusion: Annotated[
+        Colour | None,
+        Field(description="Optics of an inclusion's own, if any; only reference light sees it."),
+    ] = None
 
 
 @dataclass(frozen=True, config=CONFIG)
@@ -256,6 +260,7 @@ class Design:
             tissue=self.tissue(),
             effective_modulus_kPa=self.effective_modulus_kPa,
             wavelength_nm=wavelength,
+            inclusion=self.specimen.inclusion,
         )
 
     @property
@@ -311,11 +316,7 @@ class _Untitled(GenerateJsonSchema):
 def design_schema() -> dict[str, Any]:
     """Return the JSON schema (draft 2020-12) of a design file."""
     schema = _ADAPTER.json_schema(schema_generator=_Untitled)
-    return {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        **schema,
-        "title": "TSIS twin design",
-    }
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema, "title": "TSIS twin design"}
 
 
 _schema = lru_cache(maxsize=1)(design_schema)
@@ -376,11 +377,9 @@ def parse_design(data: dict[str, Any], source: str = "") -> Design:
 def _place(name_or_path: str | Path) -> Path:
     """Return the file of a shipped design, or the path itself."""
     source = str(name_or_path)
-    return (
-        Path(str(files("assets").joinpath("designs", f"{source}.toml")))
-        if source in shipped_designs()
-        else Path(source)
-    )
+    if source in shipped_designs():
+        return Path(str(files("assets").joinpath("designs", f"{source}.toml")))
+    return Path(source)
 
 
 def _read(name_or_path: str | Path) -> str:

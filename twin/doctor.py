@@ -18,6 +18,7 @@ import fem
 from scenes.sensor import NotModelled
 from twin import presses
 from twin.complaint import DesignError
+from twin.conflicts import colourless
 from twin.design import Design
 from twin.exposure import saturated_percent
 from twin.frame import grey
@@ -155,6 +156,7 @@ def check_up(
     """
     depth = max(design.press.indentation_mm) if indentation is None else indentation
     design.check_indentation(depth)
+    colourless(design, "a check")
     tell = progress or (lambda stage, done: None)
     tell("setting up", 0.0)
     from scenes import SpectralRenderer

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 import fem
 from twin import presses
 from twin.complaint import DesignError, shown
+from twin.conflicts import colourless
 from twin.design import Design
 from twin.presses import Quality
 from twin.stage import staged
@@ -60,8 +61,10 @@ _FIELDS = """, with vertex attributes: pressure (kPa), contact_fraction (0 to 1)
                  displacement_z (mm)"""
 
 
-def check(design: Design, inclusion: fem.Inclusion | None, levels: Sequence[float]) -> None:
+def check(design: Design, inclusion: fem.Inclusion | None, levels: Sequence[float], kind: Kind) -> None:
     """Raise `DesignError` before any work is done."""
+    if kind == "mitsuba":
+        colourless(design, "a scene for Mitsuba")
     presses.check(design, inclusion, levels)
     if len(levels) != 1:
         raise DesignError("press.indentation_mm", shown(list(levels)), "one depth for one scene")
@@ -84,7 +87,7 @@ def export(
     levels : depth of the press, mm: one.
     kind : "mitsuba" (`scenes.mitsuba_files`), or "stl" or "ply" (`scenes.meshes`).
     """
-    check(design, inclusion, levels)
+    check(design, inclusion, levels, kind)
     tell = progress or (lambda stage, done: None)
     try:
         with staged(name, _is_ours(kind)) as folder:

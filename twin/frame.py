@@ -80,7 +80,7 @@ class Frame:
     tsis: dict[str, Any] = field(default_factory=dict)
     """Scalars ``raw`` and ``tared`` of the picture, ``saturated_percent``, ``frames`` and
     ``reference_frames`` (exposures that picture and reference are the mean of), ``seconds``,
-    ``noise_percent``."""
+    ``noise_percent``, ``bias_percent`` and ``bias_of`` (`twin.light_bias`)."""
 
     @property
     def tared(self) -> NDArray[np.float32]:
@@ -93,6 +93,8 @@ class Frame:
         if self.inclusion is not None:
             units = {"size": "size_mm", "depth": "depth_mm", "modulus": "modulus_kPa", "offset": "offset_mm"}
             inclusion = {units.get(key, key): value for key, value in asdict(self.inclusion).items()}
+            if self.design.specimen.inclusion is not None:
+                inclusion["optics"] = asdict(self.design.specimen.inclusion.of(self.design.tissue()))
         return {
             "inclusion": inclusion,
             "press": self.press,

@@ -6,11 +6,12 @@ same call goes on with them. What is learned is `scenes.traced.TracedLight`.
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from scipy.stats import qmc
 import fem
 from twin import presses
 from twin.complaint import DesignError, shown
+from twin.conflicts import colourless
 from twin.design import Design, parse_design
 from twin.fields import put, tables_of
 from twin.pooled import each
@@ -74,6 +76,7 @@ def learn_light(
     from scenes import spectral, traced
 
     target = check_file(out, "out", ".npz")
+    colourless(design, "learned light")
     if samples < 64:
         raise DesignError("samples", shown(samples), "64 or more")
     file = Path(emulator) if emulator is not None else presses.EMULATORS / f"{design.name}.npz"
@@ -166,7 +169,8 @@ def trace(task: Task) -> None:
             press.surface, one.sensor.guide.width_mm, suffix=field.removeprefix("pressure")
         )
         ground = transport.survey(one.scene, one.sensor)
-        arrays = {"description": traced.describe(shape, ground.fraction).astype(np.float32)}
+        arrays: dict[str, NDArray[Any]] = {"mark": np.array(_mark(task))}
+        arrays["description"] = traced.describe(shape, ground.fraction).astype(np.float32)
         arrays |= {
             f"traced.{number}": traced.blocks(maps, _CELLS).astype(np.float32)
             for number, maps in enumerate(seen.traced)
@@ -190,23 +194,32 @@ def _files(task: Task) -> list[Path]:
     return [task.place, blank] if task.blank else [task.place]
 
 
+def _mark(task: Task) -> str:
+    """What decides a press's light: files of another design or an earlier version are traced anew."""
+    from scenes.traced import LIGHT
+
+    told = (LIGHT, task.design, task.inclusion, task.depth_mm, task.seed)
+    return hashlib.sha256(repr(told).encode()).hexdigest()[:16]
+
+
 def _kept(task: Task) -> bool:
     try:
-        return all(_read(path) is not None for path in _files(task))
+        return all(_read(path)[2] == _mark(task) for path in _files(task))
     except (OSError, ValueError, KeyError):
         return False
 
 
-def _write(path: Path, arrays: dict[str, NDArray[np.float32]]) -> None:
+def _write(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
     part = path.with_name(f".{path.name}.{os.getpid()}.part.npz")
     np.savez_compressed(part, allow_pickle=False, **arrays)
     os.replace(part, path)
 
 
-def _read(path: Path) -> tuple[NDArray[np.float32], list[NDArray[np.float32]]]:
+def _read(path: Path) -> tuple[NDArray[np.float32], list[NDArray[np.float32]], str]:
+    """Description, light of each band, and `_mark` of a press's file."""
     with np.load(path, allow_pickle=False) as file:
-        bands = [file[f"traced.{number}"] for number in range(len(file.files) - 1)]
-        return file["description"], bands
+        bands = [file[f"traced.{number}"] for number in range(len(file.files) - 2)]
+        return file["description"], bands, str(file["mark"])
 
 
 def _between(ends: tuple[float, float], share: float) -> float:

@@ -18,6 +18,7 @@ import numpy as np
 import fem
 from twin import presses
 from twin.complaint import DesignError, shown
+from twin.conflicts import colourless
 from twin.design import Design, load_design, parse_design, shipped_designs
 from twin.draws import check_bounds
 from twin.fields import expand, number_at, tables_of
@@ -76,6 +77,10 @@ def freeze(
     if count is not None and count < 1:
         raise DesignError("count", shown(count), "an integer > 0")
     design = _design(source)
+    try:
+        colourless(design, "a corpus")
+    except DesignError as error:
+        raise error.renamed(source=source.name) from None
     mechanics = mechanics or settings.mechanics or design.mechanics
     file = _emulator_file(source, design, mechanics, emulator)
     light_file = Path(traced) if traced is not None else None

@@ -16,6 +16,7 @@ from rich.table import Table
 from twin import interrupt
 from twin.captions import inclusion_in_words, mechanics_in_words
 from twin.frame import Frame
+from twin.light_bias import in_words as bias_in_words
 
 SATURATED_PERCENT = 0.1
 """Share of full pixels that is worth a line: fewer do not move the scalars."""
@@ -114,7 +115,7 @@ def _warnings(frames: Sequence[Frame]) -> Iterator[str]:
 
 
 def _trust(frames: Sequence[Frame]) -> Iterator[str]:
-    """Yield how the mechanics were computed, and how far off the tared displacement may be."""
+    """Yield how the mechanics were computed, how far off the tared displacement may be, and the light."""
     ways = [mechanics_in_words(frame.fem) for frame in frames]
     for way in dict.fromkeys(ways):
         where = ""
@@ -130,6 +131,9 @@ def _trust(frames: Sequence[Frame]) -> Iterator[str]:
         if frames[0].fem["mechanics"] == "emulator":
             what = "95 % of held-out solves were met within"
         yield f"{what}: {worst:.2g} % of the tared displacement's maximum"
+    worst = max(frame.tsis["noise_percent"] for frame in frames)
+    yield f"noise of the light: {worst:.2g} % of its mean (rms of a pixel, Monte Carlo)"
+    yield bias_in_words(frames[0].tsis)
 
 
 def _title(frame: Frame) -> str:

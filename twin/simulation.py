@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Literal, SupportsIndex, TypedDict, Unpack, ove
 import fem
 from twin import presses
 from twin.complaint import DesignError, shown
+from twin.conflicts import colourless
 from twin.design import Design, load_design
 from twin.exposure import (
     how_pressed,
@@ -24,6 +25,7 @@ from twin.exposure import (
     take_reference,
 )
 from twin.frame import Frame
+from twin.light_bias import bias_of
 from twin.presses import Mechanics, Quality
 
 if TYPE_CHECKING:
@@ -151,6 +153,11 @@ def simulate(
     seed = _seed(seed)
     if noise is not None and not 0.0 < noise < float("inf"):
         raise DesignError("noise", shown(noise), "a number > 0, per cent")
+    coloured = design.specimen.inclusion is not None
+    if coloured and quality != "reference":
+        colourless(design, f"{quality} quality")
+    if coloured and mechanics == "emulator":
+        colourless(design, "presses of an emulator, which does not know where the inclusion goes")
     light = None
     if traced is not None:
         if quality == "reference" or noise is not None:
@@ -167,7 +174,9 @@ def simulate(
         raise DesignError("emulator", "it with other mechanics", 'it with mechanics "emulator" only')
     from scenes import SpectralRenderer
 
-    renderer = SpectralRenderer(design.sensor(), count=design.light.bands, at=design.sensor, device=device)
+    renderer = SpectralRenderer(
+        design.sensor(), count=design.light.bands, at=design.sensor, device=device, coloured=coloured
+    )
     seconds = _seconds(design, len(levels)) if pressed is None else 0.0
     work = _Work(progress or (lambda stage, done: None), len(levels), seconds)
     if pressed is None:
@@ -230,10 +239,16 @@ def _frame(
 ) -> Frame:
     start = time.perf_counter()
 
+    # only a solved press knows where it carries the inclusion
+    place = (
+        press.inclusion() if design.specimen.inclusion is not None and isinstance(press, fem.Press) else None
+    )
+
     def render(field: str, before: float) -> Rendering:
         return renderer.render(
             press.surface,
             field=field,
+            place=place if field == "pressure" else None,
             **options,
             progress=lambda share: tell(before + 0.5 * share),
         )
@@ -266,5 +281,6 @@ def _frame(
             "reference_frames": reference_frames(design),
             "seconds": time.perf_counter() - start,
             "noise_percent": lit.noise_percent,
+            **bias_of(design, options["quality"], learned=options["traced"] is not None),
         },
     )
