@@ -159,16 +159,9 @@ def test_blob_and_background_are_the_references(variant: str, name: str, pytestc
             assert abs(off - said) < 3 * np.hypot(error, its_error) + 0.005, (quality, what)
 
 
-def _bins_of(name: str) -> object:
-    dark = pytest.mark.xfail(
-        strict=True, raises=AssertionError, reason="a dome's rim in front of an LED is 10 to 12 % dark"
-    )
-    return pytest.param(name, marks=dark) if name.startswith("domed") else name
-
-
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-@pytest.mark.parametrize("name", [_bins_of(name) for name in CASES])
+@pytest.mark.parametrize("name", CASES)
 def test_bins_are_the_references(variant: str, name: str) -> None:
     """Bins of 16 x 16 pixels within 3 %, borders and LED spots included."""
     standard, runs = pictures(name)
