@@ -17,11 +17,12 @@ from . import (
     surface,
 )
 from .contact import ContactOptics, contact_optics, real_contact
-from .sensor import Led, Sensor
+from .sensor import Led, NotModelled, Sensor
 from .tissue import Coupling, body_behind, couple
 
 _BLACK = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.0}}}
 _OUTWARD = {"+x": (1.0, 0.0), "-x": (-1.0, 0.0), "+y": (0.0, 1.0), "-y": (0.0, -1.0)}
+_CLEARANCE_MM = 0.01  # of the pressed surface above the next layer of other index
 _WALL_TOP_MM = 0.5  # walls reach above the contact surface, which bulges a little beside the press
 
 
@@ -50,7 +51,8 @@ def load_scene(sensor: Sensor, table: mi.TensorXf) -> mi.Scene:
     """Load the sensor with a flat, unloaded contact surface whose optics are `table` (`bsdf.Table.pack`).
 
     The contact surface is the mesh with id `contact`; LED number i is the shape with id `led_i`. Media are
-    separated by single faces: guide to air (side walls), guide to glass, glass to air. The glass's rim is
+    separated by single faces: guide to air (side walls), guide to glass, glass to air, and `layer_i` over the
+    guide's layer i, counted from 0, whose walls are `wall_+x_i` and so on. The glass's rim is
     held in a black frame and nothing surrounds the sensor (a black housing). Side walls stay flat: their
     bulge under load, 0.1 mm, is left out.
     """
@@ -63,34 +65,46 @@ def describe(sensor: Sensor, contact: mi.Mesh | dict[str, Any]) -> dict[str, Any
     guide, glass = sensor.guide, sensor.glass
     half, bottom = guide.width_mm / 2, -guide.thickness_mm
     lowest = bottom - glass.thickness_mm
-    side_wall = _side_wall(sensor)
     scene: dict[str, Any] = {
         "type": "scene",
         "camera": pinhole.describe(sensor),
         "contact": contact,
-        "guide_to_glass": _face(half, bottom, _dielectric(guide.refractive_index, glass.refractive_index)),
+        "guide_to_glass": _face(half, bottom, _dielectric(guide.bottom_index, glass.refractive_index)),
         "glass_to_air": _face(half, lowest, _dielectric(glass.refractive_index, 1.0)),
     }
+    indices, floors = [index for _, index in guide.layers], guide.floors_mm
     for side, outward in _OUTWARD.items():
-        scene[f"wall_{side}"] = _wall(half, bottom, _WALL_TOP_MM, outward, side_wall)
+        wall = _side_wall(sensor, indices[0])
+        scene[f"wall_{side}"] = _wall(half, floors[0], _WALL_TOP_MM, outward, wall)
         scene[f"rim_{side}"] = _wall(half, lowest, bottom, outward, _BLACK)
     for number, led in enumerate(sensor.leds):
         scene[f"led_{number}"] = _led(led, half, lowest)
+    for k in range(1, len(indices)):
+        scene[f"layer_{k}"] = _face(half, floors[k - 1], _dielectric(indices[k - 1], indices[k]))
+        for side, outward in _OUTWARD.items():
+            wall = _side_wall(sensor, indices[k])
+            scene[f"wall_{side}_{k}"] = _wall(half, floors[k], floors[k - 1], outward, wall)
     return scene
 
 
-def _side_wall(sensor: Sensor) -> dict[str, Any]:
-    """Polished where LEDs in air shine through: `trace` paints the walls around their windows."""
+def _side_wall(sensor: Sensor, index: float) -> dict[str, Any]:
+    """Of a layer of this index; polished where LEDs in air shine through: `trace` paints the walls around
+    their windows."""
     guide = sensor.guide
     if guide.walls == "polished" or any(led.coupling == "air" for led in sensor.leds):
-        return _dielectric(guide.refractive_index, 1.0)
+        return _dielectric(index, 1.0)
     albedo = guide.wall_albedo if guide.walls == "diffuse" else 0.0
     paint = {"type": "diffuse", "reflectance": {"type": "uniform", "value": albedo}}
     return {"type": "twosided", "bsdf": paint}
 
 
 def put_surface(scene: mi.Scene, sensor: Sensor, deformed: surface.OpticalSurface) -> None:
-    """Move the scene's contact mesh to the deformed shape and set its real contact fraction, in place."""
+    """Move the scene's contact mesh to the deformed shape and set its real contact fraction, in place.
+
+    Raises `NotModelled` where it would reach through the first of a guide's layers of different index.
+    """
+    if sensor.guide.lower:
+        _check_above(sensor, deformed)
     mesh = surface.triangulate(deformed)
     parameters = mi.traverse(scene)
     if 3 * len(mesh.vertices) != len(
@@ -103,6 +117,15 @@ def put_surface(scene: mi.Scene, sensor: Sensor, deformed: surface.OpticalSurfac
     parameters["contact.vertex_normals"] = _flat(mesh.vertex_normals)
     parameters["contact.vertex_contact_fraction"] = _flat(_fraction(sensor, deformed))
     parameters.update()
+
+
+def _check_above(sensor: Sensor, deformed: surface.OpticalSurface) -> None:
+    """Refuse a surface that reaches the plane under it, which does not give way."""
+    lowest, top = float((deformed.rest_mm + deformed.displacement_mm[..., 2]).min()), sensor.guide.top_mm
+    if lowest < _CLEARANCE_MM - top:
+        allowed = f"more than {_CLEARANCE_MM - lowest:.3g} mm under this press"
+        told = f"waveguide.layers: received {top:g} mm above the first change of index; allowed {allowed}"
+        raise NotModelled(told)
 
 
 def light_only(scene: mi.Scene, sensor: Sensor, number: int | None) -> None:

@@ -2,7 +2,7 @@
 
 These two families of paths carry most of the light and all of its sharp edges (the rims of escape and
 acceptance cones), so they are integrated without noise and without smoothing. All other paths are left to
-`trace`.
+`trace`. Through faces between a guide's layers they pass refracted; what those faces mirror is traced.
 
 Import only after a variant is set (`scenes.backend.use`).
 """
@@ -10,6 +10,7 @@ Import only after a variant is set (`scenes.backend.use`).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import drjit as dr
 import mitsuba as mi
@@ -20,6 +21,8 @@ from .build import led_frame
 from .irradiance import AngularBasis
 from .lamp import Patterns
 from .sensor import Sensor
+from .stack import Leg, Way, risen, steepness
+from .sunflower import disc_points
 from .surface import OpticalSurface, heights
 
 Array = NDArray[np.float64]
@@ -29,8 +32,9 @@ DISC_POINTS = 96
 _NEWTON_STEPS = 7  # from a guess
 _NEWTON_AGAIN = 1, 2  # from what the disc's point before foretold, if there are so many points, or fewer
 _DIRECTIONS = 24  # of a disc: neighbouring points' light counts as coming from its mean direction
-_STRIPES = 4
-_GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
+_FINER = 4  # times the points
+_NEWTON_LAYERS = 3  # in a guide of layers, whose faces a disc may cross
+_LEAST_MM = 1e-3  # of the height in the entered layer: where a disc's point lies in another, no light enters
 
 
 @dataclass(frozen=True)
@@ -43,14 +47,13 @@ class _Path:
 
     p_y: mi.Float
     p_z: mi.Float
-    p_x: mi.Float  # along the LED's axis, inside the guide
+    p_x: mi.Float  # along the LED's axis, inside the guide: no horizontal face changes it
     entry_y: mi.Float  # from the disc's point to where the ray enters the guide
     entry_z: mi.Float
     error: mi.Vector2f  # landing point minus target: along the axis, along the side
     derivative: tuple[mi.Float, mi.Float, mi.Float, mi.Float]  # of the landing point: x_y, x_z, y_y, y_z
     etendue: mi.Float  # dp_y dp_z per area of horizontal target plane
-    in_guide: mi.Float  # length, mm
-    in_glass: mi.Float
+    lengths: tuple[mi.Float, ...]  # mm, in the entered layer and on each leg
 
 
 def relief(sensor: Sensor, deformed: OpticalSurface) -> Array:
@@ -69,7 +72,7 @@ def direct(sensor: Sensor, basis: AngularBasis, deformed: OpticalSurface) -> Arr
 
 def on(sensor: Sensor, basis: AngularBasis, ground: Array, points: int = DISC_POINTS) -> Array:
     """Weighted irradiance of the two families on a `relief`, (n_led, layers, CELLS, CELLS), W/mm²,
-    from so many points of each disc.
+    from so many points of each disc, four times as many where one lies across a face between layers.
 
     From a disc of flux F and area A in a medium of index m, Lambertian or else with its pattern's factor
     (`lamp.Patterns.relative`), the element dA sends F/(pi A m²) dA
@@ -89,75 +92,90 @@ def on(sensor: Sensor, basis: AngularBasis, ground: Array, points: int = DISC_PO
     x, y = np.meshgrid(middles, middles)
     target = [_float(values) for values in (x, y, *ground)]
 
-    disc = _float(_disc_points(points))
-    end, steps = dr.opaque(mi.UInt32, points), _NEWTON_AGAIN[points < DISC_POINTS]
+    steps = _NEWTON_LAYERS if sensor.guide.lower else _NEWTON_AGAIN[points < DISC_POINTS]
     together = dr.opaque(mi.UInt32, max(points // _DIRECTIONS, 1))
+    points *= _FINER if _crossed(sensor) else 1
+    disc, end = _float(disc_points(points)), dr.opaque(mi.UInt32, points)
 
     index = dr.arange(mi.UInt32, n_led * CELLS * CELLS)
     led, point = index // (CELLS * CELLS), index % (CELLS * CELLS)
     here = [dr.gather(mi.Float, values, point) for values in target]
-    source = _Source.of(sensor, led)
+    sources = [_Source.of(sensor, led, layer) for layer in range(len(sensor.guide.layers))]
     weights = basis.weights()
+    entered = [layer for layer in range(len(sources)) if _enters(sensor, layer)]
+    families = [(layer, by_glass) for layer in entered for by_glass in (False, True)]
 
-    def more(number, straight, mirrored, *total):  # type: ignore[no-untyped-def]
+    def more(number, *state):  # type: ignore[no-untyped-def]
         return number < end
 
-    def add(number, straight, mirrored, *total):  # type: ignore[no-untyped-def]
+    def add(number, *state):  # type: ignore[no-untyped-def]
         until = dr.minimum(number + together, end)
 
-        def within(number, straight, mirrored, *sums):  # type: ignore[no-untyped-def]
+        def within(number, *state):  # type: ignore[no-untyped-def]
             return number < until
 
-        def gather(number, straight, mirrored, *sums):  # type: ignore[no-untyped-def]
+        def gather(number, *state):  # type: ignore[no-untyped-def]
             on_disc = dr.gather(mi.Point2f, disc, number)
             onwards = dr.gather(mi.Point2f, disc, dr.minimum(number + 1, end - 1)) - on_disc
             slopes, after = [], []
-            for by_glass, begin, so_far in ((False, straight, sums[:4]), (True, mirrored, sums[4:])):
+            for k, (layer, by_glass) in enumerate(families):
+                whole, *parts = state[len(families) + 4 * k :][:4]
                 flux, arriving, slope = _arrives(
-                    sensor, source, on_disc, here, by_glass, begin, onwards, steps
+                    sensor, sources[layer], on_disc, here, by_glass, state[k], onwards, steps
                 )
-                after += [so_far[0] + flux]
-                after += [whole + flux * part for whole, part in zip(so_far[1:], arriving, strict=True)]
+                after += [whole + flux]
+                after += [so_far + flux * part for so_far, part in zip(parts, arriving, strict=True)]
                 slopes.append(slope)
             return number + 1, *slopes, *after
 
-        nothing = [mi.Float(0.0) for _ in range(8)]
-        number, straight, mirrored, *sums = dr.while_loop(
-            (number, straight, mirrored, *nothing), within, gather
-        )
-        for flux, *arriving in (sums[:4], sums[4:]):
+        slopes, total = state[: len(families)], state[len(families) :]
+        nothing = [mi.Float(0.0) for _ in range(4 * len(families))]
+        number, *found = dr.while_loop((number, *slopes, *nothing), within, gather)
+        for k in range(len(families)):
+            flux, *arriving = found[len(families) + 4 * k :][:4]
             cosine, d_x, d_y = (part / dr.maximum(flux, 1e-30) for part in arriving)
             weight = weights.at(cosine, d_x, d_y, flux > 0.0)
             total = tuple(whole + flux * w for whole, w in zip(total, weight, strict=True))
-        return number, straight, mirrored, *total
+        return number, *found[: len(families)], *total
 
     first = dr.gather(mi.Point2f, disc, dr.zeros(mi.UInt32, dr.width(index)))
-    begin = [_first_guess(sensor, source, first, here, by_glass) for by_glass in (False, True)]
+    begin = [_first_guess(sensor, sources[layer], first, here, by_glass) for layer, by_glass in families]
     state = (mi.UInt32(0), *begin, *(mi.Float(0.0) for _ in range(basis.layers)))
-    total = list(dr.while_loop(state, more, add))[3:]
+    total = list(dr.while_loop(state, more, add))[1 + len(families) :]
     dr.eval(total)
     coarse = np.stack([np.asarray(layer).reshape(n_led, CELLS, CELLS) for layer in total], axis=1)
     return coarse.astype(np.float64) / points
+
+
+def _enters(sensor: Sensor, layer: int) -> bool:
+    """Whether light of an LED can come into a layer straight from its disc."""
+    floors = (0.0, *sensor.guide.floors_mm)
+    ends = [(led.z_mm - led.diameter_mm / 2, led.z_mm + led.diameter_mm / 2) for led in sensor.leds]
+    in_air = any(led.coupling == "air" for led in sensor.leds)
+    return in_air or any(low < floors[layer] and high > floors[layer + 1] for low, high in ends)
+
+
+def _crossed(sensor: Sensor) -> bool:
+    """Whether a face between layers crosses an LED's disc, so that its points count in whole numbers here and
+    there: 1 % off with 96 of them."""
+    ends = (
+        (led.z_mm - floor) / (led.diameter_mm / 2)
+        for led in sensor.leds
+        for floor in sensor.guide.floors_mm[:-1]
+    )
+    return any(abs(end) < 1.0 for end in ends)
 
 
 def _middles(half: float) -> Array:
     return (np.arange(CELLS) + 0.5) / CELLS * 2 * half - half
 
 
-def _disc_points(count: int = DISC_POINTS) -> Array:
-    """Points (count, 2) of the unit disc, a sunflower of equal areas, those in a row close together."""
-    radius = np.sqrt((np.arange(count) + 0.5) / count)
-    angle = _GOLDEN_ANGLE * np.arange(count)
-    points = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
-    stripe = np.floor((points[:, 0] + 1.0) * 0.5 * _STRIPES)
-    back_and_forth = np.where(stripe % 2 == 0, points[:, 1], -points[:, 1])
-    return np.asarray(points[np.lexsort((back_and_forth, stripe))])
-
-
 @dataclass(frozen=True)
 class _Source:
-    """The LED of each lane, in its own frame: axis into the guide, along its side, up."""
+    """The LED of each lane, in its own frame: axis into the guide, along its side, up; and one of the guide's
+    layers, for the light that enters or is born there."""
 
+    layer: int
     number: mi.UInt32
     patterns: Patterns
     axis_x: mi.Float
@@ -172,8 +190,8 @@ class _Source:
     density: mi.Float  # F / (pi m²), W: the disc's area cancels against its mean over points
 
     @staticmethod
-    def of(sensor: Sensor, led: mi.UInt32) -> _Source:
-        half, n = sensor.guide.width_mm / 2, sensor.guide.refractive_index
+    def of(sensor: Sensor, led: mi.UInt32, layer: int = 0) -> _Source:
+        half, n = sensor.guide.width_mm / 2, sensor.guide.layers[layer][1]
         rows = []
         for lamp in sensor.leds:
             _, axis, _ = led_frame(lamp, half)
@@ -196,39 +214,52 @@ class _Source:
                 ]
             )
         columns = (dr.gather(mi.Float, _float(column), led) for column in np.array(rows).T)
-        return _Source(led, Patterns(sensor.leds), *columns)
+        return _Source(layer, led, Patterns(sensor.leds), *columns)
 
 
 def _first_guess(
     sensor: Sensor, source: _Source, on_disc: mi.Point2f, here: list[mi.Float], by_glass: bool
 ) -> mi.Vector2f:
     """Slopes of the ray from a point of the disc, from those that a vanishing air gap would give."""
-    reach, aside, up = _way(sensor, source, on_disc, here, by_glass)
-    reach = dr.maximum(reach, 1e-3)
-    sine_y, sine_z = aside / reach, up / reach
-    scale = sensor.guide.refractive_index * dr.rsqrt(1.0 + dr.square(sine_y) + dr.square(sine_z))
+    way = _way(sensor, source, on_disc, here, by_glass)
+    way = replace(way, along_axis=dr.maximum(way.along_axis, 1e-3))
+    slope = _without_gap(sensor, source, way)
+    for _ in range(_NEWTON_STEPS):
+        slope = _stepped(_follow(source, way, slope), slope)
+    return slope
+
+
+def _without_gap(sensor: Sensor, source: _Source, way: Way) -> mi.Vector2f:
+    """Slopes at the disc of the ray that would come to the target if there were no air gap."""
+    way = replace(way, along_axis=dr.maximum(way.along_axis, 1e-3))
+    up = steepness(way) if sensor.guide.lower else way.up
+    sine_y, sine_z = way.along_side / way.along_axis, up / way.along_axis
+    scale = way.index * dr.rsqrt(1.0 + dr.square(sine_y) + dr.square(sine_z))
     tangential = dr.sqrt(dr.square(sine_y) + dr.square(sine_z)) * scale
     allowed = dr.minimum(1.0, 0.98 * source.index / dr.maximum(tangential, 1e-6))
     p_y, p_z = sine_y * scale * allowed, sine_z * scale * allowed
     p_x = dr.sqrt(dr.maximum(dr.square(source.index) - dr.square(p_y) - dr.square(p_z), 1e-6))
-    slope = mi.Vector2f(p_y / p_x, p_z / p_x)
-    for _ in range(_NEWTON_STEPS):
-        slope = _stepped(_follow(sensor, source, (reach, aside, up), by_glass, slope), slope)
-    return slope
+    return mi.Vector2f(p_y / p_x, p_z / p_x)
 
 
-def _way(
-    sensor: Sensor, source: _Source, on_disc: mi.Point2f, here: list[mi.Float], by_glass: bool
-) -> tuple[mi.Float, mi.Float, mi.Float]:
-    """From a point of the disc to the target: along the axis inside the guide, along the side, and up."""
+def _way(sensor: Sensor, source: _Source, on_disc: mi.Point2f, here: list[mi.Float], by_glass: bool) -> Way:
+    """From a point of the disc to the target."""
     x, y, height, _, _ = here
-    guide = sensor.guide
+    guide, glass = sensor.guide, sensor.glass
     side_y, disc_z = source.along + source.radius * on_disc.x, source.z + source.radius * on_disc.y
     # the tangent of `led_frame` is (|axis_y|, |axis_x|)
     along_axis = x * source.axis_x + y * source.axis_y + guide.width_mm / 2 - source.inset
     along_side = x * dr.abs(source.axis_y) + y * dr.abs(source.axis_x) - side_y
-    up = (disc_z + guide.thickness_mm) + (height + guide.thickness_mm) if by_glass else height - disc_z
-    return along_axis, along_side, up
+    layers, floors, own = guide.layers, guide.floors_mm, source.layer
+    roof = height if own == 0 else floors[own - 1]
+    up = disc_z - floors[own] if by_glass else roof - disc_z
+    up = dr.maximum(up, _LEAST_MM) if guide.lower else up
+    up = up + (roof - floors[own]) if by_glass else up
+    legs = [Leg(layers[k][1], height - floors[0] if k == 0 else layers[k][0]) for k in range(own)]
+    if by_glass:
+        legs += [Leg(index, 2.0 * thickness) for thickness, index in layers[own + 1 :]]
+        legs.append(Leg(glass.refractive_index, 2.0 * glass.thickness_mm))
+    return Way(along_axis, along_side, up, layers[own][1], tuple(legs))
 
 
 def _stepped(path: _Path, slope: mi.Vector2f) -> mi.Vector2f:
@@ -263,60 +294,67 @@ def _arrives(
     are found in so many steps of Newton's method from what the point before foretold."""
     slope_x, slope_y = here[3:]
     guide, glass = sensor.guide, sensor.glass
-    half, n, n_glass = guide.width_mm / 2, guide.refractive_index, glass.refractive_index
+    half, layers, floors = guide.width_mm / 2, guide.layers, guide.floors_mm
     way = _way(sensor, source, on_disc, here, by_glass)
     side_y, disc_z = source.along + source.radius * on_disc.x, source.z + source.radius * on_disc.y
-    lit = way[0] > 1e-3
+    lit = way.along_axis > 1e-3
     slope = begin
+    if guide.lower:
+        slope = dr.select(dr.isfinite(begin.x), begin, _without_gap(sensor, source, way))
     for _ in range(steps):
-        slope = _stepped(_follow(sensor, source, way, by_glass, slope), slope)
-    path = _follow(sensor, source, way, by_glass, slope)
+        slope = _stepped(_follow(source, way, slope), slope)
+    path = _follow(source, way, slope)
 
     lands = dr.abs(path.error.x) + dr.abs(path.error.y) < 1e-2
     lit &= lands
     entry_z = disc_z - path.entry_z if by_glass else disc_z + path.entry_z
-    lit &= (entry_z > -guide.thickness_mm) & (dr.abs(side_y + path.entry_y) < half)
+    lit &= (entry_z > floors[source.layer]) & (dr.abs(side_y + path.entry_y) < half)
+    if source.layer > 0:
+        lit &= entry_z <= floors[source.layer - 1]
     if guide.walls != "polished":
         to_window = mi.Vector2f(source.radius * on_disc.x + path.entry_y, source.radius * on_disc.y)
         to_window.y += -path.entry_z if by_glass else path.entry_z
         lit &= (source.gap == 0.0) | (dr.squared_norm(to_window) <= dr.square(source.window))
     tangential2 = dr.square(path.p_y) + dr.square(path.p_z)
     in_air = source.gap > 0.0
-    share = dr.select(in_air, 1.0 - _fresnel(mi.Float(1.0), mi.Float(n), tangential2), 1.0)
+    share = dr.select(in_air, 1.0 - _fresnel(mi.Float(1.0), mi.Float(way.index), tangential2), 1.0)
+    level2 = dr.square(path.p_x) + dr.square(path.p_y)
     if by_glass:
-        level2 = dr.square(path.p_x) + dr.square(path.p_y)
+        n, n_glass = guide.bottom_index, glass.refractive_index
         through = 1.0 - _fresnel(mi.Float(n), mi.Float(n_glass), level2)
         share *= dr.square(through) * _fresnel(mi.Float(n_glass), mi.Float(1.0), level2)
+    for face, ((_, above), (_, below)) in enumerate(pairwise(layers)):
+        through = 1.0 - _fresnel(mi.Float(above), mi.Float(below), level2)
+        if face < source.layer:
+            share *= through
+        elif by_glass:
+            share *= dr.square(through)
     if guide.absorption_per_mm > 0.0 or glass.absorption_per_mm > 0.0:
-        share *= dr.exp(-guide.absorption_per_mm * path.in_guide - glass.absorption_per_mm * path.in_glass)
+        in_glass = path.lengths[-1] if by_glass else mi.Float(0.0)
+        in_guide = sum(path.lengths[1 : -1 if by_glass else None], path.lengths[0])
+        share *= dr.exp(-guide.absorption_per_mm * in_guide - glass.absorption_per_mm * in_glass)
+    p_up = risen(path.p_z, way.index, guide.refractive_index)
     # the surface's slope turns its normal and lengthens its shadow
     d_x = path.p_x * source.axis_x + path.p_y * dr.abs(source.axis_y)
     d_y = path.p_x * source.axis_y + path.p_y * dr.abs(source.axis_x)
-    facing = path.p_z - d_x * slope_x - d_y * slope_y
-    cosine = facing * dr.rsqrt(1.0 + dr.square(slope_x) + dr.square(slope_y)) / n
-    flux = source.density * path.etendue * share * facing / path.p_z
+    facing = p_up - d_x * slope_x - d_y * slope_y
+    cosine = facing * dr.rsqrt(1.0 + dr.square(slope_x) + dr.square(slope_y)) / guide.refractive_index
+    flux = source.density * path.etendue * share * facing / p_up
     if not source.patterns.lambertian:
         leaving = dr.sqrt(dr.maximum(1.0 - tangential2 / dr.square(source.index), 0.0))
         rises = -path.p_z if by_glass else path.p_z
         flux *= source.patterns.relative(source.number, leaving, path.p_y, rises)
     lit &= facing > 0.0
     next_ = _foretold(path, slope, source.radius * onwards, by_glass)
-    found = dr.select(lands & dr.isfinite(next_.x + next_.y), next_, begin)
+    lost = mi.Vector2f(dr.nan) if guide.lower else begin
+    found = dr.select(lands & dr.isfinite(next_.x + next_.y), next_, lost)
     arriving = tuple(dr.select(lit, value, 1.0) for value in (cosine, d_x, d_y))
     return dr.select(lit, flux, 0.0), arriving, found
 
 
-def _follow(
-    sensor: Sensor,
-    source: _Source,
-    way: tuple[mi.Float, mi.Float, mi.Float],
-    by_glass: bool,
-    slope: mi.Vector2f,
-) -> _Path:
+def _follow(source: _Source, way: Way, slope: mi.Vector2f) -> _Path:
     """A ray from its slopes at the disc to the target's height, with derivatives to the slopes."""
-    n, n_glass = sensor.guide.refractive_index, sensor.glass.refractive_index
-    through_glass = 2.0 * sensor.glass.thickness_mm if by_glass else 0.0
-    along_axis, along_side, up = way
+    n = way.index
     t_y, t_z = slope.x, slope.y
     one = 1.0 + dr.square(t_y) + dr.square(t_z)
     c = source.index * dr.rsqrt(one)
@@ -326,22 +364,22 @@ def _follow(
     p_x = dr.sqrt(dr.maximum(n**2 - dr.square(p_y) - dr.square(p_z), 1e-9))
     px_y, px_z = -(p_y * py_y + p_z * pz_y) / p_x, -(p_y * py_z + p_z * pz_z) / p_x
 
-    run = (up - source.gap * t_z) / p_z  # length over index, inside the guide
-    in_guide, in_glass = n * run, mi.Float(0.0)
+    run = (way.up - source.gap * t_z) / p_z  # length over index, inside the guide
     run_y, run_z = -run * pz_y / p_z, -run * pz_z / p_z - source.gap / p_z
-    if through_glass > 0.0:
-        g2 = dr.maximum(n_glass**2 - n**2 + dr.square(p_z), 1e-9)
-        below = through_glass * dr.rsqrt(g2)
+    lengths = [n * run]
+    for leg in way.legs:
+        g2 = dr.maximum(leg.index**2 - n**2 + dr.square(p_z), 1e-9)
+        below = leg.height * dr.rsqrt(g2)
         factor = -below * p_z / g2
-        in_glass = n_glass * below
+        lengths.append(leg.index * below)
         run, run_y, run_z = run + below, run_y + factor * pz_y, run_z + factor * pz_z
 
     x_y, x_z = px_y * run + p_x * run_y, px_z * run + p_x * run_z
     y_y, y_z = source.gap + py_y * run + p_y * run_y, py_z * run + p_y * run_z
-    error = mi.Vector2f(p_x * run - along_axis, source.gap * t_y + p_y * run - along_side)
+    error = mi.Vector2f(p_x * run - way.along_axis, source.gap * t_y + p_y * run - way.along_side)
     etendue = dr.square(source.index / one) / dr.abs(x_y * y_z - x_z * y_y)
     derivative, entry = (x_y, x_z, y_y, y_z), (source.gap * t_y, source.gap * t_z)
-    return _Path(p_y, p_z, p_x, *entry, error, derivative, etendue, in_guide, in_glass)
+    return _Path(p_y, p_z, p_x, *entry, error, derivative, etendue, tuple(lengths))
 
 
 def _fresnel(n_in: mi.Float, n_out: mi.Float, tangential2: mi.Float) -> mi.Float:

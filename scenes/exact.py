@@ -21,7 +21,7 @@ from . import trace, wander
 from .bsdf import Table
 from .faces import CONTACT, NOTHING, Faces
 from .sensor import Sensor
-from .view import PixelRays
+from .view import PixelRays, below_mm
 
 Array = NDArray[np.float64]
 
@@ -54,7 +54,7 @@ class Film:
     def at(sensor: Sensor, rays: PixelRays, height_mm: float) -> Film:
         """The plane at a height above the contact surface, mm."""
         lean = rays.direction[..., :2] / rays.direction[..., 2:]
-        hits = rays.origin_mm[..., :2] + lean * (height_mm + sensor.guide.thickness_mm)
+        hits = rays.origin_mm[..., :2] + lean * (height_mm + sensor.guide.top_mm)
         rows, columns = hits.shape[:2]
         by_column, by_row = (np.gradient(hits, axis=axis) for axis in (1, 0))
         area = np.abs(by_column[..., 0] * by_row[..., 1] - by_column[..., 1] * by_row[..., 0])
@@ -186,6 +186,7 @@ def exact(
     context = mi.BSDFContext(mi.TransportMode.Importance)
     spots = wander.Spots.of(sensor, fraction, even)
     lump = None if place is None else wander.Lump.of(sensor, place)
+    least = sensor.guide.under_contact_mm(1.0)
     squeezed = (sensor.guide.refractive_index / sensor.tissue.refractive_index) ** 2
 
     index = dr.arange(mi.UInt32, n_led * samples)
@@ -234,7 +235,7 @@ def exact(
                 sensor, table, spots, views, met, number, throughput, enters, random, scores, lump
             )
             share = dr.select(enters, left, share)
-            following = dr.select(enters, _come_back(scene, contact, back), following)
+            following = dr.select(enters, _come_back(scene, contact, back, least), following)
         kept = throughput * share
         survive = dr.select(bounce < _SURE_BOUNCES, 1.0, dr.minimum(kept, 0.95))
         alive = alive & (kept > 0.0) & (random.next_float32() < survive) & (bounce < _MAX_BOUNCES)
@@ -258,14 +259,14 @@ def exact(
 def mirrored_run_mm(sensor: Sensor) -> float:
     """How much deeper in the guide the surface seems when it is seen by the glass's lower face, near the
     axis."""
-    guide, glass = sensor.guide, sensor.glass
-    ratio = guide.refractive_index / glass.refractive_index
-    return 2.0 * (guide.thickness_mm + glass.thickness_mm * ratio)
+    return 2.0 * (sensor.guide.top_mm + below_mm(sensor))
 
 
-def _come_back(scene: mi.Scene, contact: mi.Shape, ray: mi.Ray3f) -> mi.Ray3f:
-    """A ray that leaves the tissue, from the surface itself: tissue is flat only over a spot of light."""
-    below = mi.Ray3f(mi.Point3f(ray.o.x, ray.o.y, ray.o.z - _BELOW_MM), mi.Vector3f(0.0, 0.0, 1.0))
+def _come_back(scene: mi.Scene, contact: mi.Shape, ray: mi.Ray3f, least: float) -> mi.Ray3f:
+    """A ray that leaves the tissue, from the surface itself: tissue is flat only over a spot of light. It is
+    looked for from a height that is at least this."""
+    start = dr.maximum(ray.o.z - _BELOW_MM, least)
+    below = mi.Ray3f(mi.Point3f(ray.o.x, ray.o.y, start), mi.Vector3f(0.0, 0.0, 1.0))
     si = scene.ray_intersect(below)
     meets = si.is_valid() & (si.shape == mi.ShapePtr(contact))
     start = si.spawn_ray(ray.d)

@@ -1,9 +1,9 @@
 """Where rays meet the sensor's faces, and what polished faces do: the scene's laws without its dispatch.
 
 `mi.Scene.ray_intersect` fills in a full interaction and calls the shape and BSDF that were met, which takes
-longer than finding them. The sensor has six kinds of faces, and all but the contact surface are flat, so that
-little is needed here: the meeting itself is Mitsuba's, position, normals and contact fraction on the mesh are
-interpolated as Mitsuba does it, and dielectrics follow Fresnel.
+longer than finding them. The sensor has seven kinds of faces, and all but the contact surface are flat, so
+that little is needed here: the meeting itself is Mitsuba's, position, normals and contact fraction on the
+mesh are interpolated as Mitsuba does it, and dielectrics follow Fresnel.
 
 Import only after a variant is set (`scenes.backend.use`).
 """
@@ -18,7 +18,7 @@ import numpy as np
 
 from .sensor import Sensor
 
-NOTHING, CONTACT, TO_GLASS, TO_AIR, WALL, RIM, LED = range(7)
+NOTHING, CONTACT, TO_GLASS, TO_AIR, WALL, RIM, LED, LAYER = range(8)
 _KINDS = {"contact": CONTACT, "guide_to_glass": TO_GLASS, "glass_to_air": TO_AIR}
 _EPSILON = 1500.0 * 2.0**-24  # Mitsuba's for spawned rays, relative to the coordinates
 
@@ -81,9 +81,11 @@ class Faces:
         for name, index in number.items():
             table[index] = (*_normal(name), _kind(name))
         self._table = mi.Float(table.ravel())
-        guide, glass = sensor.guide.refractive_index, sensor.glass.refractive_index
-        # inside over outside, by kind; inside is the side that the normal points away from
-        self._eta = mi.Float([1.0, 1.0, guide / glass, glass, guide, 1.0, 1.0])
+        # inside over outside; inside is the side that the normal points away from
+        eta = np.ones(len(table), dtype=np.float32)
+        for name, index in number.items():
+            eta[index] = _eta(name, sensor)
+        self._eta = mi.Float(eta)
 
         contact = shapes["contact"]
         fraction = contact.attribute_buffer("vertex_contact_fraction")
@@ -117,7 +119,7 @@ class Faces:
 
     def eta(self, meeting: Meeting) -> mi.Float:
         """Index inside over that outside, as `mi.fresnel` takes it."""
-        return dr.gather(mi.Float, self._eta, meeting.kind)
+        return dr.gather(mi.Float, self._eta, dr.reinterpret_array(mi.UInt32, meeting.shape))
 
     def polished(self, meeting: Meeting, sample: mi.Float) -> mi.Vector3f:
         """Direction after a flat dielectric face: mirrored with Fresnel's share as chance, else refracted."""
@@ -141,12 +143,24 @@ def _in_fours(buffer: mi.Float, width: int, last: mi.Float | None = None) -> mi.
 def _kind(name: str) -> int:
     if name in _KINDS:
         return _KINDS[name]
-    return {"wall": WALL, "rim": RIM, "led": LED}[name.split("_")[0]]
+    return {"wall": WALL, "rim": RIM, "led": LED, "layer": LAYER}[name.split("_")[0]]
+
+
+def _eta(name: str, sensor: Sensor) -> float:
+    """Index inside over that outside, of a face as `build` names it; 1 where light does not pass."""
+    kind, number = _kind(name), name.rpartition("_")[2]
+    indices = [index for _, index in sensor.guide.layers]
+    if kind == LAYER:
+        return indices[int(number) - 1] / indices[int(number)]
+    if kind == WALL:
+        return indices[int(number) if number.isdigit() else 0]
+    glass = sensor.glass.refractive_index
+    return {TO_GLASS: indices[-1] / glass, TO_AIR: glass}.get(kind, 1.0)
 
 
 def _normal(name: str) -> tuple[float, float, float]:
     """As `build` sets them; LEDs and the contact surface have none here."""
-    if name in ("guide_to_glass", "glass_to_air"):
+    if _kind(name) in (TO_GLASS, TO_AIR, LAYER):
         return 0.0, 0.0, -1.0
     kind, _, side = name.partition("_")
     if kind not in ("wall", "rim"):

@@ -6,6 +6,7 @@ Import only after a variant is set (`scenes.backend.use`).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import drjit as dr
 import mitsuba as mi
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from .bsdf import Table
 from .build import led_frame, radiance
+from .climb import STEP_MM, climb, descend
 from .irradiance import look_up
 from .lamp import Patterns
 from .passage import Seen
@@ -21,7 +23,6 @@ from .sensor import Sensor
 from .tissue import Coupling
 from .view import PixelRays, faces_reflectance
 
-_STEP_MM = 1e-3  # off a face before looking on
 _ASIDE_MM = (1.3e-4, 0.7e-4, 0.0)  # along neither the sides nor the diagonals of the mesh
 _SIGHTS = 2  # the surface seen directly, and mirrored once in the lower faces; a third sight adds 1e-5
 
@@ -71,13 +72,18 @@ def look(scene: mi.Scene, sensor: Sensor, table: Table, coupling: Coupling, rays
     named = {shape.id(): mi.ShapePtr(shape) for shape in scene.shapes()}
     # the run in the glass and back, near the axis, as one in the guide
     in_glass = 2.0 * sensor.glass.thickness_mm * guide.refractive_index / sensor.glass.refractive_index
+    in_glass += sum(2.0 * h * guide.refractive_index / n for h, n in guide.layers[1:])
+    deeper = _in_layers(sensor, rays.direction[..., 2])
     lamps, patterns = [mi.Float(0.0) for _ in sensor.leds], Patterns(sensor.leds)
     points: list[tuple[mi.Float, mi.Float, mi.Float]] = []
     windows = []
     # sine of the angle in the tissue, by Snell's law
     bend = float(np.sqrt(coupling.scale))
-    start = mi.Point3f(*origin) + _STEP_MM / direction.z * direction
+    start = mi.Point3f(*origin) + STEP_MM / direction.z * direction
     for _ in range(_SIGHTS):
+        for rung in climb(scene, sensor, start, direction):
+            _add_lamps(lamps, rung.met, gain * deeper[rung.layer - 1], sensor, named, patterns)
+            gain = dr.select(rung.passes, gain, 0.0)
         si = meet(scene, named["contact"], start, direction)
         seen = si.is_valid() & (si.shape == named["contact"])
         _add_lamps(lamps, si, gain, sensor, named, patterns)
@@ -92,16 +98,20 @@ def look(scene: mi.Scene, sensor: Sensor, table: Table, coupling: Coupling, rays
         # mirrored in the contact surface, down, mirrored in the lower faces, up again; the slope left out
         gain = dr.select(seen, gain * (1.0 - transmitted), 0.0)
         down = mi.Vector3f(direction.x, direction.y, -direction.z)
-        below = scene.ray_intersect(mi.Ray3f(si.p + _STEP_MM * down, down), seen)
+        below = scene.ray_intersect(mi.Ray3f(si.p + STEP_MM * down, down), seen)
         _add_lamps(lamps, below, gain, sensor, named, patterns)
-        through = below.is_valid() & (below.shape == named["guide_to_glass"])
+        through = below.is_valid() & (below.shape == named["layer_1" if guide.lower else "guide_to_glass"])
+        for rung in descend(scene, sensor, si.p, down):
+            alight = dr.select(through, gain * deeper[rung.layer - 1], 0.0)
+            _add_lamps(lamps, rung.met, alight, sensor, named, patterns)
+            through &= rung.passes
         _add_lamps_below(lamps, si.p, down, dr.select(through, gain, 0.0), sensor, patterns)
-        gain = dr.select(below.shape == named["guide_to_glass"], gain * mirrored, 0.0)
-        run = (si.p.z + guide.thickness_mm + in_glass) / direction.z
-        start = mi.Point3f(si.p.x, si.p.y, -guide.thickness_mm) + mi.Vector3f(
+        gain = dr.select(through, gain * mirrored, 0.0)
+        run = (si.p.z + guide.top_mm + in_glass) / direction.z
+        start = mi.Point3f(si.p.x, si.p.y, -guide.top_mm) + mi.Vector3f(
             run * direction.x, run * direction.y, 0.0
         )
-        start += _STEP_MM / direction.z * direction
+        start += STEP_MM / direction.z * direction
     off_normal = 1.0 - dr.sqrt(dr.maximum(1.0 - coupling.scale * dr.squared_norm(lean), 0.0))
     dr.eval(points, windows, lamps, lean, off_normal)
     x, y = (np.asarray(points[0][i]).reshape(shape) for i in (0, 1))
@@ -112,6 +122,21 @@ def look(scene: mi.Scene, sensor: Sensor, table: Table, coupling: Coupling, rays
     through = np.stack([np.asarray(window).reshape(shape) for window in windows])
     where = position.astype(np.float32)
     return Sight(where, points, (bend * lean.x, bend * lean.y), off_normal, guide.width_mm, through, layers)
+
+
+def _in_layers(sensor: Sensor, cosine: NDArray[np.float64]) -> list[mi.Float]:
+    """Radiance at the camera per radiance in each lower layer, over that in the first one, at cosines there.
+
+    (On the way to a mirror image the share that faces between layers send back, 1e-3, counts as passed.)
+    """
+    first = sensor.guide.refractive_index
+    through = 1.0 - faces_reflectance(sensor, cosine)
+    found = []
+    for k, layer in enumerate(sensor.guide.lower, start=1):
+        ratio = (1.0 - faces_reflectance(sensor, cosine, k)) / np.maximum(through, 1e-9)
+        ratio *= (first / layer.refractive_index) ** 2
+        found.append(mi.Float(ratio.astype(np.float32).ravel()))
+    return found
 
 
 def meet(
@@ -160,13 +185,15 @@ def _add_lamps_below(
     """
     guide, glass = sensor.guide, sensor.glass
     n1, n2 = guide.refractive_index, glass.refractive_index
+    indices = [index for _, index in guide.layers]
     px, py = n1 * down.x, n1 * down.y
     square = dr.square(px) + dr.square(py)
 
     def per_index(index: float) -> mi.Float:
         return dr.rsqrt(dr.maximum(index**2 - square, 1e-6))
 
-    run = (point.z + guide.thickness_mm) * per_index(n1)
+    run = (point.z + guide.top_mm) * per_index(n1)
+    run += sum(thickness * per_index(index) for thickness, index in guide.layers[1:])
     for number, led in enumerate(sensor.leds):
         if led.side != "below":
             continue
@@ -177,14 +204,20 @@ def _add_lamps_below(
             through += led.gap_mm * per_index(1.0)
         off_x, off_y = point.x + through * px - led.x_mm, point.y + through * py - led.y_mm
         meets = (dr.square(off_x) + dr.square(off_y) < (led.diameter_mm / 2) ** 2) & (square < medium**2)
-        lost = _fresnel(n1, n2, square)
+        lost = _fresnel(indices[-1], n2, square)
         if in_air:
-            second = _fresnel(n2, 1.0, square)
-            lost = lost + dr.square(1.0 - lost) * second / dr.maximum(1.0 - lost * second, 1e-6)
+            lost = _both(lost, _fresnel(n2, 1.0, square))
+        for above, below in list(pairwise(indices))[::-1]:
+            lost = _both(_fresnel(above, below, square), lost)
         cosine = dr.sqrt(dr.maximum(1.0 - square / medium**2, 0.0))
         leaves = patterns.relative(mi.UInt32(number), cosine, -px, -py)
         seen = gain * (1.0 - lost) * (n1 / medium) ** 2 * radiance(led) * leaves
         lamps[number] += dr.select(meets, seen, 0.0)
+
+
+def _both(first: mi.Float, second: mi.Float) -> mi.Float:
+    """Reflectance of a face and all below it, with the reflections between them."""
+    return first + dr.square(1.0 - first) * second / dr.maximum(1.0 - first * second, 1e-6)
 
 
 def _fresnel(n_in: float, n_out: float, square: mi.Float) -> mi.Float:

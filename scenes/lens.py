@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.signal import fftconvolve
 
 from . import view
-from .sensor import Sensor
+from .sensor import Guide, Sensor
 
 Array = NDArray[np.float64]
 
@@ -50,18 +50,29 @@ def lens_of(sensor: Sensor) -> Lens:
     """The thin lens that the field of view, the distance and the plane in focus ask for.
 
     Seen through a flat face, depth t in an index n seems t/n (Hecht 2017, section 5.2; key hecht2017): the
-    surface stands at u = distance + t_glass/n_glass + t_guide/n_guide. With the image distance v that the
-    rays to the edge of the field ask for, Gauss' 1/f = 1/u_f + 1/v holds for the plane in focus, u_f. A point
-    at u then spreads over a disc of pupil * v * |1/u - 1/u_f|.
+    surface stands at u = distance + t_glass/n_glass + sum of t/n over the guide's layers. With the image
+    distance v that the rays to the edge of the field ask for, Gauss' 1/f = 1/u_f + 1/v holds for the plane in
+    focus, u_f. A point at u then spreads over a disc of pupil * v * |1/u - 1/u_f|.
     """
-    camera, n = sensor.camera, sensor.guide.refractive_index
+    camera, guide = sensor.camera, sensor.guide
     seems = camera.distance_mm + sensor.glass.thickness_mm / sensor.glass.refractive_index
-    seems += sensor.guide.thickness_mm / n
-    sharp = seems + camera.focus_mm / n
+    seems += sum(thickness / index for thickness, index in guide.layers)
+    sharp = seems + _seems(guide, camera.focus_mm)
     image = 1.0 / view.tangent_scale(sensor)
     focal = 1.0 / (1.0 / sharp + 1.0 / image)
     pupil = focal / camera.f_number
     return Lens(focal, seems, image, pupil, pupil * image * abs(1.0 / seems - 1.0 / sharp))
+
+
+def _seems(guide: Guide, height_mm: float) -> float:
+    """How high above the contact surface a plane seems to lie, mm; below it, through the layers up to it."""
+    if height_mm > -guide.top_mm or not guide.lower:
+        return height_mm / guide.refractive_index
+    seems, left = 0.0, -height_mm
+    for thickness, index in guide.layers:
+        seems -= min(thickness, left) / index
+        left -= min(thickness, left)
+    return seems
 
 
 def through(sensor: Sensor, radiance: Array) -> Array:

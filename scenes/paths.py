@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from . import trace
 from .bsdf import Table
+from .climb import climb
 from .faces import CONTACT, LED, NOTHING, WALL, Faces
 from .sensor import Sensor
 from .view import PixelRays
@@ -132,10 +133,19 @@ def in_sight(scene: mi.Scene, sensor: Sensor, rays: PixelRays) -> NDArray[np.flo
         for part in (rays.origin_mm, rays.direction)
     )
     aim = mi.Vector3f(*direction)
-    si = scene.ray_intersect(mi.Ray3f(mi.Point3f(*origin) + 1e-3 / aim.z * aim, aim))
-    front = si.is_valid() & (mi.Frame3f.cos_theta(si.wi) > 0.0)
     shapes = {shape.id(): mi.ShapePtr(shape) for shape in scene.shapes()}
-    leds = [front & (si.shape == shapes[f"led_{number}"]) for number in range(len(sensor.leds))]
+    leds = [mi.Bool(False) for _ in sensor.leds]
+    clear = mi.Bool(True)
+
+    def add(si: mi.SurfaceInteraction3f) -> None:
+        front = clear & si.is_valid() & (mi.Frame3f.cos_theta(si.wi) > 0.0)
+        for number in range(len(leds)):
+            leds[number] |= front & (si.shape == shapes[f"led_{number}"])
+
+    for rung in climb(scene, sensor, mi.Point3f(*origin), aim):
+        add(rung.met)
+        clear = clear & rung.passes
+    add(scene.ray_intersect(mi.Ray3f(mi.Point3f(*origin) + 1e-3 / aim.z * aim, aim)))
     return np.array([np.mean(np.asarray(meets)) for meets in leds])
 
 

@@ -9,7 +9,8 @@ against each other.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import field, replace
+from itertools import accumulate, pairwise
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -27,6 +28,7 @@ __all__ = [
     "Glass",
     "Guide",
     "Led",
+    "Lower",
     "NotModelled",
     "Sensor",
     "Side",
@@ -42,13 +44,25 @@ class NotModelled(ValueError):
 
 
 @dataclass(frozen=True, config=CONFIG)
+class Lower:
+    """A layer of the guide under its first one, of another index than its neighbours'."""
+
+    thickness_mm: Annotated[Length, Field(description="Thickness of the layer, mm.")]
+    refractive_index: Annotated[RefractiveIndex, Field(description="Refractive index of the layer.")]
+
+
+@dataclass(frozen=True, config=CONFIG)
 class Guide:
-    """The waveguide as light sees it: a square block of elastomer with one index through all its layers."""
+    """The waveguide as light sees it: a square block of elastomer, of one index or in layers.
+
+    The faces between layers are horizontal planes, where they lie unpressed.
+    """
 
     width_mm: Annotated[Length, Field(description="Side of the square contact surface, mm.")]
     thickness_mm: Annotated[Length, Field(description="Thickness from contact surface to glass, mm.")]
     refractive_index: Annotated[
-        RefractiveIndex, Field(description="Refractive index of the guide at the light's wavelength.")
+        RefractiveIndex,
+        Field(description="Refractive index of the guide at the contact, at the light's wavelength."),
     ] = 1.4336
     absorption_per_mm: Annotated[
         Absorption, Field(description="Absorption coefficient of the guide, 1/mm (PDMS: about 0.001).")
@@ -63,6 +77,66 @@ class Guide:
     wall_albedo: Annotated[
         float, Field(ge=0.0, le=1.0, description="Share of light that diffuse walls send back, 0 to 1.")
     ] = 0.9
+    # not in the repr: what is hashed of guides of one index stays what it was
+    lower: Annotated[
+        tuple[Lower, ...],
+        Field(
+            max_length=15,
+            description="Layers of other index under the first, which is what they leave of the thickness; "
+            "the last lies on the glass.",
+        ),
+    ] = field(default=(), repr=False)
+
+    def __post_init__(self) -> None:
+        """The first layer has a thickness, and neighbours differ."""
+        if self.top_mm < MIN_LAYER_MM * (1.0 - 1e-9):
+            allowed = f"layers that leave the first one {MIN_LAYER_MM:g} mm of {self.thickness_mm:g} mm"
+            raise ValueError(f"lower: received {self.thickness_mm - self.top_mm:g} mm; allowed {allowed}")
+        indices = [index for _, index in self.layers]
+        if any(same(*pair) for pair in pairwise(indices)):
+            raise ValueError(f"lower: received indices {indices}; allowed neighbours that differ")
+
+    @property
+    def top_mm(self) -> float:
+        """Thickness of the layer under the contact, mm: of all the guide where it has one index."""
+        return self.thickness_mm - sum(layer.thickness_mm for layer in self.lower)
+
+    @property
+    def layers(self) -> tuple[tuple[float, float], ...]:
+        """Thickness, mm, and index of each layer, from the contact side."""
+        return (
+            (self.top_mm, self.refractive_index),
+            *((layer.thickness_mm, layer.refractive_index) for layer in self.lower),
+        )
+
+    @property
+    def floors_mm(self) -> tuple[float, ...]:
+        """Height of each layer's lower face, mm, from the contact side; the last is the glass's."""
+        floors = accumulate(thickness for thickness, _ in self.layers[:-1])
+        return (*(-depth for depth in floors), -self.thickness_mm)
+
+    @property
+    def bottom_index(self) -> float:
+        """Refractive index at the glass."""
+        return self.layers[-1][1]
+
+    def index_at(self, z_mm: float) -> float:
+        """Refractive index at a height, mm."""
+        heights = zip(self.layers, self.floors_mm, strict=True)
+        return next((index for (_, index), floor in heights if z_mm > floor), self.bottom_index)
+
+    def under_contact_mm(self, share: float) -> float:
+        """Height, mm, of a place so far down the guide, but no lower than its first layer."""
+        return -min(share * self.thickness_mm, self.top_mm - 1e-3)
+
+
+def same(index: float, other: float) -> bool:
+    """Whether two indices are one to light: single precision cannot tell them apart."""
+    return abs(index - other) < 1e-6
+
+
+MIN_LAYER_MM = 0.05
+"""Thinnest layer of the guide with an index of its own, as `Length` has it."""
 
 
 @dataclass(frozen=True, config=CONFIG)
@@ -132,7 +206,8 @@ def conflicts(
         yield Conflict(
             "skin.gap_index",
             skin.gap_index,
-            f"a number below the guide's index {guide.refractive_index:g} (else no light is trapped)",
+            f"a number below the guide's index {guide.refractive_index:g}"
+            f"{' at the contact' if guide.lower else ''} (else no light is trapped)",
         )
     if skin.sheet and skin.sheet.scattering_per_mm + skin.sheet.absorption_per_mm < MIN_EXTINCTION:
         yield Conflict(

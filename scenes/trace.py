@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from .bsdf import Table
 from .build import led_frame
-from .faces import CONTACT, LED, NOTHING, TO_AIR, TO_GLASS, WALL, Faces, Meeting
+from .faces import CONTACT, LAYER, LED, NOTHING, TO_AIR, TO_GLASS, WALL, Faces, Meeting
 from .irradiance import AngularBasis, look_up
 from .lamp import Patterns
 from .sensor import Sensor
@@ -230,7 +230,7 @@ def depart(scene: mi.Scene, sensor: Sensor, table: Table, u: list[mi.Float]) -> 
     """Rays even over the guide's face, in directions as T(cos) cos, of points of the unit 4-cube."""
     width = sensor.guide.width_mm
     x, y = (u[0] - 0.5) * width, (u[1] - 0.5) * width
-    below = mi.Ray3f(mi.Point3f(x, y, -0.25 * sensor.guide.thickness_mm), mi.Vector3f(0.0, 0.0, 1.0))
+    below = mi.Ray3f(mi.Point3f(x, y, sensor.guide.under_contact_mm(0.25)), mi.Vector3f(0.0, 0.0, 1.0))
     si = scene.ray_intersect(below)
     contact = next(shape for shape in scene.shapes() if shape.id() == "contact")
     meets = si.is_valid() & (si.shape == mi.ShapePtr(contact))
@@ -295,7 +295,7 @@ def bounce_off(
 ) -> tuple[mi.Vector3f, mi.Float]:
     """Direction and share of the light after a face that is not the front of the contact surface."""
     direction = faces.polished(met, sample1)
-    clear = (met.kind == TO_GLASS) | (met.kind == TO_AIR) | (met.kind == WALL)
+    clear = (met.kind == TO_GLASS) | (met.kind == TO_AIR) | (met.kind == WALL) | (met.kind == LAYER)
     share = dr.select(active & clear, 1.0, 0.0)
     if sensor.guide.walls != "polished":
         coated = painted(sensor, met, active)
@@ -324,8 +324,10 @@ def _next_leg(leg: mi.UInt32, kind: mi.UInt32, passed: mi.Bool) -> mi.UInt32:
     for before, event, after in (
         (IN_AIR, (kind == WALL) & passed, IN_GUIDE),
         (IN_GUIDE, (kind == TO_GLASS) & passed, _DOWN),
+        (IN_GUIDE, (kind == LAYER) & passed, IN_GUIDE),
         (_DOWN, (kind == TO_AIR) & ~passed, _IN_GLASS_UP),
         (_IN_GLASS_UP, (kind == TO_GLASS) & passed, _BACK_UP),
+        (_BACK_UP, (kind == LAYER) & passed, _BACK_UP),
     ):
         following = dr.select((leg == before) & event, mi.UInt32(after), following)
     return following

@@ -98,7 +98,16 @@ def optics_key(sensor: Sensor) -> str:
     and what the contact fraction says."""
     leds = tuple(replace(led, flux_W=1.0) for led in sensor.leds)
     skin = replace(sensor.skin, rms_slope=1.0, kappa=1.0)
-    told = (LIGHT, sensor.guide, sensor.glass, leds, skin, sensor.tissue, sensor.wavelength_nm)
+    told: tuple[object, ...] = (
+        LIGHT,
+        sensor.guide,
+        sensor.glass,
+        leds,
+        skin,
+        sensor.tissue,
+        sensor.wavelength_nm,
+    )
+    told += (sensor.guide.lower,) if sensor.guide.lower else ()
     return hashlib.sha256(repr(told).encode()).hexdigest()[:16]
 
 

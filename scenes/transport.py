@@ -93,7 +93,7 @@ def survey(scene: mi.Scene, sensor: Sensor) -> Ground:
     middles = (np.arange(GRID) + 0.5) / GRID * width - width / 2
     x, y = (mi.Float(values.ravel().astype(np.float32)) for values in np.meshgrid(middles, middles))
     contact = next(shape for shape in scene.shapes() if shape.id() == "contact")
-    height = -0.5 * sensor.guide.thickness_mm
+    height = sensor.guide.under_contact_mm(0.5)
     si = meet(scene, mi.ShapePtr(contact), mi.Point3f(x, y, height), mi.Vector3f(0.0, 0.0, 1.0))
     meets = si.is_valid() & (si.shape == mi.ShapePtr(contact))
     fraction = dr.select(meets, contact.eval_attribute_1("vertex_contact_fraction", si, meets), 0.0)

@@ -7,6 +7,7 @@ other way.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,17 +22,17 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PixelRays:
-    """Rays of the camera's pixels just inside the guide's lower face, going up.
+    """Rays of the camera's pixels where they come into the guide, going up; of a guide in layers, where they
+    come into the one under the contact.
 
     Attributes
     ----------
     origin_mm, direction : (rows, columns, 3)
-        Point on the face between guide and glass, and unit direction.
+        Point on the face between guide and glass (on the first layer's lower face), and unit direction.
     transmittance : (rows, columns)
-        Fresnel transmittance of both faces together, unpolarised, with the reflections inside the glass
-        summed.
+        Fresnel transmittance of all faces together, unpolarised, with the reflections between them summed.
     radiance_scale : float
-        Radiance in air over radiance in the guide of an unattenuated ray, 1/n² (conservation of étendue).
+        Radiance in air over radiance there of an unattenuated ray, 1/n² (conservation of étendue).
     """
 
     origin_mm: Array
@@ -117,10 +118,21 @@ def pixel_rays(sensor: Sensor) -> PixelRays:
     in_guide = _refract(in_air, guide.refractive_index)
     offset = in_air[..., :2] / in_air[..., 2:] * camera.distance_mm
     offset = offset + in_glass[..., :2] / in_glass[..., 2:] * glass.thickness_mm
-    origin = np.concatenate([offset, np.full((*offset.shape[:2], 1), -guide.thickness_mm)], axis=-1)
+    for layer in reversed(guide.lower):
+        inside = _refract(in_air, layer.refractive_index)
+        offset = offset + inside[..., :2] / inside[..., 2:] * layer.thickness_mm
+    origin = np.concatenate([offset, np.full((*offset.shape[:2], 1), guide.floors_mm[0])], axis=-1)
     transmittance = 1.0 - faces_reflectance(sensor, in_guide[..., 2])
     transmittance = np.where(_blocked(sensor, in_air, in_glass), 0.0, transmittance)
     return PixelRays(origin, in_guide, transmittance, 1.0 / guide.refractive_index**2)
+
+
+def below_mm(sensor: Sensor) -> float:
+    """Depth of glass and lower layers in millimetres of the guide's first one, near the axis."""
+    guide, glass = sensor.guide, sensor.glass
+    first = guide.refractive_index
+    depth = glass.thickness_mm * (first / glass.refractive_index)
+    return depth + sum(layer.thickness_mm * first / layer.refractive_index for layer in guide.lower)
 
 
 def _blocked(sensor: Sensor, in_air: Array, in_glass: Array) -> NDArray[np.bool_]:
@@ -138,30 +150,32 @@ def _blocked(sensor: Sensor, in_air: Array, in_glass: Array) -> NDArray[np.bool_
     return blocked
 
 
-def faces_reflectance(sensor: Sensor, cosine: Array) -> Array:
-    """Share of light that the faces guide/glass and glass/air send back, same shape as `cosine` (in the
-    guide).
+def faces_reflectance(sensor: Sensor, cosine: Array, layer: int = 0) -> Array:
+    """Share of light that all faces below a layer of the guide, those of the glass among them, send back,
+    same shape as `cosine` (in the first layer).
 
-    Incoherent sum over the reflections inside the glass: R = R1 + (1 - R1)² R2 / (1 - R1 R2).
+    Incoherent sum over the reflections between a face and all below it: R = R1 + (1 - R1)² R2 / (1 - R1 R2).
     """
-    n1, n2 = sensor.guide.refractive_index, sensor.glass.refractive_index
-    sine = n1 * np.sqrt(1.0 - np.asarray(cosine) ** 2)
-    first, second = _fresnel(n1, n2, sine), _fresnel(n2, 1.0, sine)
-    return _both_faces(first, second)
+    return _stacked(sensor, cosine, layer, _fresnel)
 
 
 def faces_reflectances(sensor: Sensor, cosine: Array) -> tuple[Array, Array]:
     """`faces_reflectance` of s and of p polarised light."""
-    n1, n2 = sensor.guide.refractive_index, sensor.glass.refractive_index
-    sine = n1 * np.sqrt(1.0 - np.asarray(cosine) ** 2)
-    faces = zip(_fresnel_apart(n1, n2, sine), _fresnel_apart(n2, 1.0, sine), strict=True)
-    s, p = (_both_faces(*pair) for pair in faces)
+    s, p = (_stacked(sensor, cosine, 0, lambda *face, way=way: _fresnel_apart(*face)[way]) for way in (0, 1))
     return s, p
 
 
-def _both_faces(first: Array, second: Array) -> Array:
-    passes = 1.0 - first * second  # 0 where the first face reflects all already
-    return np.asarray(first + (1.0 - first) ** 2 * second / np.where(passes > 0.0, passes, 1.0))
+def _stacked(sensor: Sensor, cosine: Array, layer: int, fresnel: Callable[..., Array]) -> Array:
+    n2 = sensor.glass.refractive_index
+    indices = [index for _, index in sensor.guide.layers]
+    sine = indices[0] * np.sqrt(1.0 - np.asarray(cosine) ** 2)
+    second, below = fresnel(n2, 1.0, sine), n2
+    for index in reversed(indices[layer:]):
+        first = fresnel(index, below, sine)
+        passes = 1.0 - first * second  # 0 where the first face reflects all already
+        second = first + (1.0 - first) ** 2 * second / np.where(passes > 0.0, passes, 1.0)
+        below = index
+    return np.asarray(second)
 
 
 def _fresnel(n_in: float, n_out: float, n_sine: Array) -> Array:
@@ -189,6 +203,6 @@ def _reach(sensor: Sensor, sine: float) -> float:
     path = (
         (sensor.camera.distance_mm, 1.0),
         (sensor.glass.thickness_mm, sensor.glass.refractive_index),
-        (sensor.guide.thickness_mm, sensor.guide.refractive_index),
+        *reversed(sensor.guide.layers),
     )
     return float(sum(length * sine / np.sqrt(n**2 - sine**2) for length, n in path))

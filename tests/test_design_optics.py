@@ -103,3 +103,28 @@ def test_indices_follow_the_wavelength_where_none_is_fixed(data):
     assert red.glass.refractive_index == pytest.approx(1.5145, abs=2e-4)
     fixed = load_design("tsis")
     assert fixed.sensor(450.0).guide.refractive_index == fixed.sensor(650.0).guide.refractive_index == 1.4336
+
+
+def layered(*indices, **surface):
+    """The shipped design with an index for each layer, None where it says none."""
+    data = tomllib.loads(TSIS)
+    for layer, index in zip(data["waveguide"]["layers"], indices, strict=True):
+        if index is not None:
+            layer["refractive_index"] = index
+    data["surface"].update(surface)
+    return parse_design(data)
+
+
+def test_layers_have_indices_of_their_own():
+    """Neighbours of one index are one layer to light; the mechanics never know."""
+    plain, own = load_design("tsis"), layered(1.4, None, 1.5)
+    assert layered(1.4336, None, 1.4336).guide() == plain.guide()
+    assert own.guide().layers == ((2.0, 1.4), (3.0, 1.4336), (5.0, 1.5))
+    assert layered(1.4, 1.4, None).guide().layers == ((5.0, 1.4), (5.0, 1.4336))
+    assert own.probe() == plain.probe()
+    with pytest.raises(DesignError, match=r"surface.gap_index: received 1.33; .* index 1.2 at the contact"):
+        layered(1.2, None, None, gap_index=1.33)
+    with pytest.raises(
+        DesignError, match=r"waveguide.layers.1.refractive_index: received 0.5; allowed .*>= 1"
+    ):
+        layered(None, 0.5, None)

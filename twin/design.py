@@ -16,20 +16,19 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 from pydantic.json_schema import GenerateJsonSchema
 
 import fem
-from fem.model import DomeRadius, Length, Modulus, Offset, Poisson, Sides, Tilt
-from scenes import dispersion, ies
+from fem.model import Length, Modulus, Offset, Poisson, Sides, Tilt
+from scenes import ies
 from scenes.led import Light
-from scenes.sensor import Camera, Glass, Guide, Led, Sensor, Walls
+from scenes.sensor import Camera, Glass, Guide, Led, Sensor
 from scenes.skin import Absorption, Anisotropy, Colour, RefractiveIndex, Scattering, Skin, Tissue
 from twin.complaint import DesignError, from_validation, not_finite, shown
 from twin.conflicts import design_conflicts, inclusion_conflicts
-
-CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False)
+from twin.waveguide import CONFIG, Waveguide
 
 MAX_STRAIN = 0.2
 """Deepest press, as a share of the slab's thickness, 6 mm into 30 mm: no deeper one has been compared with an
@@ -42,46 +41,6 @@ _ONE_LINE = r"^[^\x00-\x1f\x7f-\x9f]*$"
 
 Depth = Annotated[float, Field(ge=MIN_INDENTATION_MM, le=100.0)]
 Mechanics = Literal["finite", "linear"]
-
-
-@dataclass(frozen=True, config=CONFIG)
-class Waveguide:
-    """The waveguide: a square, layered block of transparent elastomer, bonded to the glass."""
-
-    width_mm: Annotated[Length, Field(description="Side of the square contact surface, mm.")]
-    layers: Annotated[
-        tuple[fem.Layer, ...],
-        Field(min_length=1, max_length=16, description="Elastic layers, from the contact side."),
-    ]
-    refractive_index: Annotated[
-        RefractiveIndex | None,
-        Field(
-            description="Refractive index of all layers, the same for all light; that of Sylgard 184, which "
-            "falls with the wavelength, if left out."
-        ),
-    ] = None
-    absorption_per_mm: Annotated[
-        Absorption, Field(description="Absorption coefficient of all layers, 1/mm (PDMS: about 0.001).")
-    ] = 0.0
-    walls: Annotated[
-        Walls,
-        Field(
-            description="Side faces: polished; or painted, but for windows before LEDs in air: absorbing, "
-            "or diffuse (white)."
-        ),
-    ] = "polished"
-    wall_albedo: Annotated[
-        float, Field(ge=0.0, le=1.0, description="Share of light that diffuse walls send back, 0 to 1.")
-    ] = 0.9
-    dome_radius_mm: Annotated[
-        DomeRadius,
-        Field(description="Radius of a domed contact surface with its apex in the middle, mm; none if flat."),
-    ] = None
-
-    @property
-    def thickness_mm(self) -> float:
-        """Thickness of all layers together, mm."""
-        return sum(layer.thickness_mm for layer in self.layers)
 
 
 @dataclass(frozen=True, config=CONFIG)
@@ -190,7 +149,8 @@ class Design:
     def probe(self) -> fem.Probe:
         """Return the waveguide as the mechanics see it."""
         guide = self.waveguide
-        return fem.Probe(width_mm=guide.width_mm, layers=guide.layers, dome_radius_mm=guide.dome_radius_mm)
+        layers = tuple(fem.Layer(one.thickness_mm, one.modulus_kPa, one.poisson) for one in guide.layers)
+        return fem.Probe(width_mm=guide.width_mm, layers=layers, dome_radius_mm=guide.dome_radius_mm)
 
     def slab(self) -> fem.Slab:
         """Return the specimen as the mechanics see it."""
@@ -232,16 +192,7 @@ class Design:
 
     def guide(self, wavelength_nm: float | None = None) -> Guide:
         """Return the waveguide as light of a wavelength sees it, by default that of `light`."""
-        waveguide, index = self.waveguide, self.waveguide.refractive_index
-        index = index or dispersion.pdms(wavelength_nm or self.light.wavelength_nm)
-        return Guide(
-            width_mm=waveguide.width_mm,
-            thickness_mm=waveguide.thickness_mm,
-            refractive_index=index,
-            absorption_per_mm=waveguide.absorption_per_mm,
-            walls=waveguide.walls,
-            wall_albedo=waveguide.wall_albedo,
-        )
+        return self.waveguide.optics(wavelength_nm or self.light.wavelength_nm)
 
     def tissue(self) -> Tissue:
         """Return the specimen as light sees it."""

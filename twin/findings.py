@@ -185,16 +185,30 @@ def _rim(checkup: Checkup) -> Iterator[Finding]:
 
 def _indices(checkup: Checkup) -> Iterator[Finding]:
     design = checkup.design
-    n, gap = design.guide().refractive_index, design.surface.gap_index
+    guide, gap = design.guide(), design.surface.gap_index
+    n = guide.refractive_index
     sheet = design.surface.sheet
     behind, field = (sheet, "surface.sheet") if sheet else (design.specimen, "specimen")
     tissue = behind.refractive_index
     air = [str(k) for k, led in enumerate(design.leds) if _place(led) == "air"]
-    if air and n**2 - 1.0 < gap**2:
+    lit = [guide.index_at(led.z_mm) for led in design.leds if led.side != "below"]
+    entered = min((guide.index_at(design.leds[int(k)].z_mm) for k in air), default=n)
+    if lit and n < max(lit):
+        angle = np.degrees(np.arccos(n / max(lit)))
+        yield Finding(
+            "note",
+            "waveguide.layers.0.refractive_index",
+            f"light flatter than {angle:.0f}° to the surface in the layer of {max(lit):.4g} never comes to "
+            "the contact",
+            f"The first layer's index ({n:.4g}) is below that of a layer that LEDs shine into",
+            "A first layer of higher index, or LEDs at its height, use more of the light",
+        )
+    if air and entered**2 - 1.0 < gap**2:
         yield Finding(
             "warning",
             "waveguide.refractive_index",
-            f"{n:.4g} lets light of LEDs in air (leds {', '.join(air)}) out through the contact surface",
+            f"{entered:.4g} lets light of LEDs in air (leds {', '.join(air)}) out through the contact "
+            "surface",
             f"Only above {np.sqrt(1.0 + gap**2):.3f} is all light from a side face trapped by gaps of index "
             f"{gap:g}",
             "Take a guide of higher index" + (" or keep the gaps dry" if gap > 1.0 else ""),

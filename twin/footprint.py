@@ -34,12 +34,19 @@ def sight(sensor: Sensor) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return x and y, mm, where each pixel's line of sight meets the undeformed surface, (rows, columns)."""
     camera, guide, glass = sensor.camera, sensor.guide, sensor.glass
     lens = (camera.shape, camera.pitch_mm, camera.field_of_view_mm, camera.distance_mm, camera.distortion)
-    key = (lens, guide.thickness_mm, guide.refractive_index, glass.thickness_mm, glass.refractive_index)
+    key = (
+        lens,
+        guide.thickness_mm,
+        guide.refractive_index,
+        glass.thickness_mm,
+        glass.refractive_index,
+        guide.lower,
+    )
     if key not in _KEPT:
         if len(_KEPT) >= 4:  # a corpus may have a lens of its own for each sample
             _KEPT.pop(next(iter(_KEPT)))
         rays = view.pixel_rays(sensor)
-        away = rays.direction[..., :2] / rays.direction[..., 2:] * guide.thickness_mm
+        away = rays.direction[..., :2] / rays.direction[..., 2:] * guide.top_mm
         x, y = np.moveaxis((rays.origin_mm[..., :2] + away).astype(np.float32), -1, 0)
         _KEPT[key] = np.ascontiguousarray(x), np.ascontiguousarray(y)
     return _KEPT[key]

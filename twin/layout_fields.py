@@ -7,7 +7,8 @@ A study's fields are dotted names of the design ("leds.*.z_mm"), and these:
 - `layout.power_W`: flux of all LEDs together, shared evenly;
 - `layout.sheet_mm`: thickness of a white contact sheet, 0 for none;
 - `layout.match_gain`: true for a gain at which the full well is the converter's last count;
-- `layout.layers`: thickness and modulus of each layer, [[mm, kPa], ...] from the contact side;
+- `layout.layers`: thickness and modulus of each layer, [[mm, kPa], ...] from the contact side, all of the
+  waveguide's index;
 - `protocol.indentation_mm`, `protocol.positions_mm` (lists, as choices) and `protocol.frames`.
 """
 

@@ -127,6 +127,9 @@ def _draw_side(axes: Axes, checkup: Checkup, axis: str) -> None:
     axes.add_patch(
         Rectangle((-half, lowest), 2 * half, glass.thickness_mm, facecolor=GLASS, alpha=0.7, **edge)
     )
+    optics = design.guide()
+    for face in optics.floors_mm[:-1]:
+        axes.plot([-half, half], [face] * 2, color=INK, lw=0.5, ls=(0, (2, 2)), zorder=4)
     for sign in (-1, 1):  # the black frame about the glass
         axes.plot([sign * half] * 2, [lowest, bottom], color="black", lw=2, solid_capstyle="butt", zorder=4)
     shown = [k for k, led in enumerate(design.leds) if led.side[-1] == axis or led.side == "below"]
@@ -135,7 +138,9 @@ def _draw_side(axes: Axes, checkup: Checkup, axis: str) -> None:
     _draw_camera(axes, checkup, across, lowest)
     aim: dict[str, Any] = {"fontsize": 7, "zorder": 20, "va": "center"}
     axes.text(-half - 0.6, top - _TISSUE_MM / 2, "tissue", ha="right", **aim)
-    axes.text(half + 1.2, bottom + 1.0, f"guide, n = {design.guide().refractive_index:.4g}", **aim)
+    roofs = (2.0 + bottom, *optics.floors_mm[:-1]) if not optics.lower else (0.0, *optics.floors_mm[:-1])
+    for ceiling, floor, (_, index) in zip(roofs, optics.floors_mm, optics.layers, strict=True):
+        axes.text(half + 1.2, 0.5 * (ceiling + floor), f"guide, n = {index:.4g}", **aim)
     axes.text(half + 1.2, 0.5 * (bottom + lowest), f"glass, n = {glass.refractive_index:g}", **aim)
     axes.set_xlim(-half - _BESIDE_MM, half + _BESIDE_MM + 3)
     axes.set_ylim(lowest - _BELOW_MM, top)
@@ -181,15 +186,19 @@ def _draw_camera(axes: Axes, checkup: Checkup, across: int, lowest: float) -> No
     ends = (
         ((rows // 2, 0), (rows // 2, columns - 1)) if across == 0 else ((0, columns // 2), (-1, columns // 2))
     )
-    bottom, distance = -sensor.guide.thickness_mm, sensor.camera.distance_mm
+    distance = sensor.camera.distance_mm
     cone = []
     for row, column in ends:
         start, aim = rays.origin_mm[row, column], rays.direction[row, column]
-        upper = start[across] + aim[across] / aim[2] * -bottom
+        upper = start[across] - aim[across] / aim[2] * start[2]
         sine = aim[across] * sensor.guide.refractive_index
+        corners = [(upper, 0.0), (start[across], sensor.guide.floors_mm[0])]
+        for layer, floor in zip(sensor.guide.lower, sensor.guide.floors_mm[1:], strict=True):
+            run = sine / np.sqrt(layer.refractive_index**2 - sine**2) * layer.thickness_mm
+            corners.append((corners[-1][0] - run, floor))
         lower = sine / np.sqrt(1.0 - sine**2) * distance
         cut = lower * (1.0 - _BELOW_MM / distance)
-        cone.append([(upper, 0.0), (start[across], bottom), (lower, lowest), (cut, lowest - _BELOW_MM)])
+        cone.append([*corners, (lower, lowest), (cut, lowest - _BELOW_MM)])
     outline = Polygon([*cone[0], *cone[1][::-1]], closed=True, facecolor="#2b8cbe", alpha=0.08, zorder=3)
     axes.add_patch(outline)
     for edge in cone:
