@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .build import led_frame
-from .irradiance import AngularBasis
+from .irradiance import Layered
 from .lamp import Patterns
 from .sensor import Sensor
 from .surface import OpticalSurface, heights
@@ -61,12 +61,12 @@ def relief(sensor: Sensor, deformed: OpticalSurface) -> Array:
     return np.stack([height, slope_x, slope_y])
 
 
-def direct(sensor: Sensor, basis: AngularBasis, deformed: OpticalSurface) -> Array:
+def direct(sensor: Sensor, basis: Layered, deformed: OpticalSurface) -> Array:
     """Weighted irradiance of the two families, (n_led, layers, CELLS, CELLS), W/mm²; see `on`."""
     return on(sensor, basis, relief(sensor, deformed))
 
 
-def on(sensor: Sensor, basis: AngularBasis, ground: Array, points: int = DISC_POINTS) -> Array:
+def on(sensor: Sensor, basis: Layered, ground: Array, points: int = DISC_POINTS) -> Array:
     """Weighted irradiance of the two families on a `relief`, (n_led, layers, CELLS, CELLS), W/mm²,
     from so many points of each disc.
 
@@ -84,18 +84,77 @@ def on(sensor: Sensor, basis: AngularBasis, ground: Array, points: int = DISC_PO
             some = replace(sensor, leds=tuple(sensor.leds[number] for number in here))
             found[here] = on(some, basis, ground, points)
         return found
+    led, here = _targets(sensor, ground)
+    total = _summed(sensor, basis, _Source.of(sensor, led), here, points)
+    dr.eval(total)
+    return _maps(total, n_led) / points
+
+
+def answers(
+    sensor: Sensor, basis: Layered, ground: Array, change: Change, points: int = DISC_POINTS
+) -> Array:
+    """Derivative of `on` along a change, (n_led, layers, CELLS, CELLS), W/mm² per unit.
+
+    By Dr.Jit's automatic differentiation, forwards, of the very loop that gathers: discs move as a whole and
+    their points with them. The outline of the side face, and of a window in a painted wall, which cut off
+    light, stay where they are. LEDs below answer nothing.
+    """
+    here = [number for number, led in enumerate(sensor.leds) if led.side != "below" and led.flux_W > 0.0]
+    found = np.zeros((len(sensor.leds), basis.layers, CELLS, CELLS))
+    if not here:
+        return found
+    some = replace(sensor, leds=tuple(sensor.leds[number] for number in here))
+    step = dr.opaque(mi.Float, 0.0)  # a literal would grow in place to the size of what it is multiplied by
+    dr.enable_grad(step)
+    led, where = _targets(some, ground)
+    if change.ground is not None:
+        _, moves = _targets(some, change.ground)
+        where[2:] = [at + step * move for at, move in zip(where[2:], moves[2:], strict=True)]
+    source = _Source.of(some, led)
+    moved = {"along": source.along + step * change.along_mm, "z": source.z + step * change.z_mm}
+    if change.exponent:
+        moved["patterns"] = source.patterns.sharper(step * change.exponent)
+    total = _summed(some, basis, replace(source, **moved), where, points)
+    dr.forward(step)
+    slopes = dr.grad(total)
+    dr.eval(slopes)
+    found[here] = _maps(slopes, len(here)) / points
+    return found
+
+
+@dataclass(frozen=True)
+class Change:
+    """What one unit of a parameter changes: the place of every LED along its side and up, mm, and its
+    pattern's exponent; `relief` (3, CELLS, CELLS), or None."""
+
+    along_mm: float = 0.0
+    z_mm: float = 0.0
+    exponent: float = 0.0
+    ground: Array | None = None
+
+
+def _targets(sensor: Sensor, ground: Array) -> tuple[mi.UInt32, list[mi.Float]]:
+    """LED of each lane, and what it shines at: x, y and the relief."""
     middles = _middles(sensor.guide.width_mm / 2)
     x, y = np.meshgrid(middles, middles)
     target = [_float(values) for values in (x, y, *ground)]
+    index = dr.arange(mi.UInt32, len(sensor.leds) * CELLS * CELLS)
+    led, point = index // (CELLS * CELLS), index % (CELLS * CELLS)
+    return led, [dr.gather(mi.Float, values, point) for values in target]
 
+
+def _maps(total: list[mi.Float], n_led: int) -> Array:
+    layers = np.stack([np.asarray(layer).reshape(n_led, CELLS, CELLS) for layer in total], axis=1)
+    return layers.astype(np.float64)
+
+
+def _summed(
+    sensor: Sensor, basis: Layered, source: _Source, here: list[mi.Float], points: int
+) -> list[mi.Float]:
+    """Layers of weighted irradiance of each lane's target, summed over the points of its LED's disc."""
     disc = _float(_disc_points(points))
     end, steps = dr.opaque(mi.UInt32, points), _NEWTON_AGAIN[points < DISC_POINTS]
-
-    index = dr.arange(mi.UInt32, n_led * CELLS * CELLS)
-    led, point = index // (CELLS * CELLS), index % (CELLS * CELLS)
-    here = [dr.gather(mi.Float, values, point) for values in target]
-    source = _Source.of(sensor, led)
-    weights = basis.weights()
+    weights, lanes = basis.weights(), dr.width(source.number)
 
     def more(number, straight, mirrored, *total):  # type: ignore[no-untyped-def]
         return number < end
@@ -113,13 +172,10 @@ def on(sensor: Sensor, basis: AngularBasis, ground: Array, points: int = DISC_PO
             slopes.append(slope)
         return number + 1, *slopes, *total
 
-    first = dr.gather(mi.Point2f, disc, dr.zeros(mi.UInt32, dr.width(index)))
+    first = dr.gather(mi.Point2f, disc, dr.zeros(mi.UInt32, lanes))
     begin = [_first_guess(sensor, source, first, here, by_glass) for by_glass in (False, True)]
     state = (mi.UInt32(0), *begin, *(mi.Float(0.0) for _ in range(basis.layers)))
-    total = list(dr.while_loop(state, more, add))[3:]
-    dr.eval(total)
-    coarse = np.stack([np.asarray(layer).reshape(n_led, CELLS, CELLS) for layer in total], axis=1)
-    return coarse.astype(np.float64) / points
+    return list(dr.while_loop(state, more, add))[3:]
 
 
 def _middles(half: float) -> Array:

@@ -1,0 +1,210 @@
+"""Derivatives of the standard picture against central differences of whole pictures, with common seeds."""
+
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+import pytest
+from sensors import paper_sensor, pressed
+
+from scenes.contact import contact_fraction
+from scenes.skin import Skin
+
+WIDTH = 25.0
+PLACE = (1.0, 0.0)  # of the bump
+SKIN = {"skin.rms_slope": 0.1, "skin.rms_height_um": 0.5, "skin.gap_index": 0.002, "skin.dust": 0.02}
+STEPS = {
+    "leds.flux_W": 1e-3,
+    "leds.exponent": 0.1,
+    "leds.along_mm": 0.1,
+    "leds.z_mm": 0.3,
+    **SKIN,
+    "effective_modulus_kPa": 0.3,
+    "pressure": 0.05,
+    "bump": 0.05,
+    "height": 0.02,
+}
+"""What is differentiated, and half the distance of the first differences."""
+
+
+def sensor():
+    """Two LEDs off the middle, with a lens, before a skin with a little dust; a small picture."""
+    one = paper_sensor(columns=96, rows=61, pixel_um=(67.2, 78.4))
+    lamps = zip(one.leds[:3:2], (3.0, 2.0), (-3.5, -6.0), strict=True)
+    leds = tuple(
+        replace(led, pattern="power", exponent=1.5, along_mm=along, z_mm=z) for led, along, z in lamps
+    )
+    return replace(one, leds=leds, skin=Skin(dust=0.05))
+
+
+def press(scale=1.0, bump=0.0, height=0.0):
+    """A bump of pressure, which pushes the surface down and aside; as much of each more."""
+    from scenes import surface
+
+    def rise(x, y):
+        return np.exp(-((x - PLACE[0]) ** 2 + (y - PLACE[1]) ** 2) / 20.0)
+
+    found = pressed(
+        lambda x, y: scale * (0.9 + (0.4 + bump) * rise(x, y)),
+        lambda x, y: (0.01 * x * rise(x, y), 0.01 * y * rise(x, y), -0.1 - (0.04 - height) * rise(x, y)),
+    )
+    return surface.resample(found, WIDTH)
+
+
+def moved(name, off):
+    """Sensor and press with a parameter off by so much."""
+    one = sensor()
+    if name.startswith("leds."):
+        field = name.removeprefix("leds.")
+        return replace(
+            one, leds=tuple(replace(a, **{field: getattr(a, field) + off}) for a in one.leds)
+        ), press()
+    if name.startswith("skin."):
+        field = name.removeprefix("skin.")
+        return replace(one, skin=replace(one.skin, **{field: getattr(one.skin, field) + off})), press()
+    if name == "effective_modulus_kPa":
+        return replace(one, effective_modulus_kPa=one.effective_modulus_kPa + off), press()
+    return one, press(**{"scale" if name == "pressure" else name: off + float(name == "pressure")})
+
+
+def parameters(names):
+    """As `gradients` takes them."""
+    from scenes.gradients import Press
+
+    bump = press(bump=1.0).pressure_kPa - press().pressure_kPa
+    height = press(height=1.0).displacement_mm - press().displacement_mm
+    ours = {"bump": Press("bump", pressure_kPa=bump), "height": Press("height", displacement_mm=height)}
+    return [ours.get(name, name) for name in names]
+
+
+@cache
+def renderer_of(there):
+    from scenes.render import Renderer
+
+    return Renderer(there, device="cpu")
+
+
+def picture(name, off, seed, samples):
+    there, shape = moved(name, off)
+    return renderer_of(there).render(shape, seed=seed, samples=samples).radiance.astype(float)
+
+
+def difference(name, step, seed, samples):
+    """Derivative of the picture, by differences of second order; of an index of 1 they look up only."""
+    at = {1: 0.5, -1: -0.5}
+    if name == "skin.gap_index":
+        at = {0: -1.5, 1: 2.0, 2: -0.5}
+    return sum(w / step * picture(name, k * step, seed, samples) for k, w in at.items())
+
+
+@dataclass(frozen=True)
+class Means:
+    """Of pictures (..., n_led, rows, columns), all LEDs together: over the blob, and far from it."""
+
+    blob: np.ndarray
+    background: np.ndarray
+
+    @staticmethod
+    def of(pictures):
+        rows, columns = np.shape(pictures)[-2:]
+        x = ((np.arange(columns) + 0.5) / columns - 0.5) * WIDTH
+        y = -((np.arange(rows) + 0.5) / rows - 0.5) * 18.5
+        away = np.hypot(x - PLACE[0], y[:, None] - PLACE[1])
+        whole = np.sum(pictures, axis=-3)
+        return Means(whole[..., away < 3.0].mean(axis=-1), whole[..., away > 7.0].mean(axis=-1))
+
+
+def apart(found, expected):
+    """Largest difference of two pairs of means, relative to the second."""
+    pairs = ((found.blob, expected.blob), (found.background, expected.background))
+    return np.max([np.abs(one - other) / np.abs(other) for one, other in pairs], axis=0)
+
+
+def compared(names, seeds, samples):
+    """Means of derivatives (seeds, names), and of differences over whole and half steps; all with common
+    seeds."""
+    from scenes.gradients import gradients
+    from scenes.render import Renderer
+
+    renderer = Renderer(sensor(), device="cpu")
+    asked = parameters(names)
+    found, whole, half = [], [], []
+    for seed in seeds:
+        found.append(gradients(renderer, press(), asked, samples=samples, seed=seed).slopes)
+        whole.append([difference(name, STEPS[name], seed, samples) for name in names])
+        half.append([difference(name, 0.5 * STEPS[name], seed, samples) for name in names])
+    return tuple(Means.of(np.array(one)) for one in (found, whole, half))
+
+
+def test_the_contact_law_is_differentiated(variant):
+    """Dr.Jit's derivative of the contact fraction against differences of the law in NumPy."""
+    from scenes.gradients import fraction_slope
+
+    one, pressure = sensor(), np.linspace(0.0, 6.0, 60)
+    change = np.cos(pressure)
+
+    def law(pressure=pressure, slope=one.skin.rms_slope, kappa=one.skin.kappa):
+        return contact_fraction(pressure, one.effective_modulus_kPa, slope, kappa)
+
+    step = 1e-5
+    for name, low, high in (
+        ("skin.rms_slope", law(slope=2.0 - step), law(slope=2.0 + step)),
+        ("skin.kappa", law(kappa=1.6 - step), law(kappa=1.6 + step)),
+        ("pressure", law(pressure - step * change), law(pressure + step * change)),
+    ):
+        found = fraction_slope(one, pressure, name, change if name == "pressure" else None)
+        inside = slice(1, None)  # no pressure, no pull
+        np.testing.assert_allclose(found[inside], ((high - low) / (2 * step))[inside], atol=1e-8)
+
+
+def test_gathered_light_is_differentiated_through_its_loop(variant):
+    """Dr.Jit's derivatives of irradiance on the contact, to an LED's place and pattern and to the relief,
+    against differences; away from the rim beside the LEDs, where light has edges."""
+    from scenes import direct
+    from scenes.irradiance import AngularBasis
+
+    one, ground = sensor(), direct.relief(sensor(), press())
+    everything = AngularBasis(np.ones((1, 2, 1)), np.ones((1, 2)))
+    rise = direct.relief(one, press(height=1.0)) - ground
+
+    def light(name="leds.z_mm", off=0.0, ground=ground):
+        return direct.on(moved(name, off)[0], everything, ground)[:, 0, 40:160, 40:160]
+
+    cases = {
+        "leds.along_mm": direct.Change(along_mm=1.0),
+        "leds.z_mm": direct.Change(z_mm=1.0),
+        "leds.exponent": direct.Change(exponent=1.0),
+        "height": direct.Change(ground=rise),
+    }
+    for name, change in cases.items():
+        found = direct.answers(one, everything, ground, change)[:, 0, 40:160, 40:160]
+        step = 0.02
+        low, high = (
+            light(ground=ground + off * rise) if name == "height" else light(name, off)
+            for off in (-step, step)
+        )
+        expected = (high - low) / (2 * step)
+        assert np.linalg.norm(found - expected) < 0.01 * np.linalg.norm(expected), name
+        assert np.linalg.norm(-found - expected) > np.linalg.norm(expected), name
+
+
+@pytest.mark.parametrize(
+    ("parameter", "says"),
+    [
+        ("leds.power", "allowed: leds.flux_W"),
+        ("leds.exponent", "allowed: 'power'"),
+        ("leds.z_mm", "allowed: LEDs at the sides"),
+        ("pressure", "where skin.contact is 'rough'"),
+    ],
+)
+def test_what_a_sensor_has_not_is_refused(variant, parameter, says):
+    """In one line, before anything is computed."""
+    from scenes.gradients import gradients
+    from scenes.render import Renderer
+
+    one = paper_sensor(columns=16, rows=16, pixel_um=(403.0, 300.0))
+    leds = (replace(one.leds[0], side="below"),)
+    renderer = Renderer(replace(one, leds=leds, skin=Skin(contact="full")), device="cpu")
+    with pytest.raises(ValueError, match=says) as refused:
+        gradients(renderer, press(), [parameter])
+    assert "\n" not in str(refused.value)
