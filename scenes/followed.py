@@ -97,7 +97,7 @@ def _from_leds(stage: Stage, each: int, start: NDArray[np.integer], seed: int) -
 
     A disc that moves changes its light by what its rim sends (Reynolds' transport theorem): with even
     emission per area, (2/R) times the mean over the rim of what a ray leaves there times the rim's move
-    outwards.
+    outwards. Rays of opposite points of the rim go in pairs, with the same choices: their noise cancels.
     """
     sensor, emission = stage.sensor, stage.emission
     number, u = _lanes(sensor, each, start)
@@ -117,8 +117,11 @@ def _from_leds(stage: Stage, each: int, start: NDArray[np.integer], seed: int) -
     flux = np.array([led.flux_W for led in sensor.leds])
     maps = _walked(stage, number, ray, one, leg, seed, flux, stage.answers, scores)
 
+    number, u = _lanes(sensor, each, start, paired=True)
     moving = np.flatnonzero((emission.along_mm != 0.0) | (emission.z_mm != 0.0))
     if moving.size:
+        odd = dr.arange(mi.UInt32, dr.width(number)) & 1
+        u[0] = u[0] + 0.5 * mi.Float(odd)
         ray = trace.emit(sensor, number, u, rim=True)
         sine, cosine = dr.sincos(dr.two_pi * u[0])
         upright = [-1.0 if led.side in ("+x", "-y") else 1.0 for led in sensor.leds]
@@ -127,7 +130,7 @@ def _from_leds(stage: Stage, each: int, start: NDArray[np.integer], seed: int) -
         scores = [
             per * (cosine * float(emission.along_mm[k]) + rises * float(emission.z_mm[k])) for k in moving
         ]
-        maps.slopes[moving] += _walked(stage, number, ray, one, leg, seed, flux, None, scores).slopes
+        maps.slopes[moving] += _walked(stage, number, ray, one, leg, seed, flux, None, scores, True).slopes
     return maps
 
 
@@ -152,12 +155,13 @@ def _walked(
     scale: Array,
     answers: Answers | None,
     scores: Sequence[mi.Float],
+    paired: bool = False,
 ) -> Landed:
     """What a walk leaves, smooth; `scale` (n_led,) is W of a throughput of 1."""
     sensor = stage.sensor
     dr.eval(ray, amount, *scores)
     parts = (stage.scene, sensor, stage.table, stage.basis, number, ray, amount, leg, seed)
-    found = trace.walk(*parts, answers, scores)
+    found = trace.walk(*parts, answers, scores, paired)
     each = dr.width(number) // len(sensor.leds)
     area = (sensor.guide.width_mm / trace.CELLS) ** 2
     factor = (scale / each / area)[:, None, None, None]
@@ -167,8 +171,13 @@ def _walked(
     )
 
 
-def _lanes(sensor: Sensor, each: int, start: NDArray[np.integer]) -> tuple[mi.UInt32, list[mi.Float]]:
-    """LED of each lane, and its point of the unit 4-cube."""
-    index = dr.arange(mi.UInt32, len(sensor.leds) * each)
-    number = index // mi.UInt32(dr.opaque(mi.UInt32, each))
-    return number, trace.evenly(trace.side_by_side(each, len(sensor.leds)), start)
+def _lanes(
+    sensor: Sensor, each: int, start: NDArray[np.integer], *, paired: bool = False
+) -> tuple[mi.UInt32, list[mi.Float]]:
+    """LED of each lane, and its point of the unit 4-cube; the same for two and two lanes if `paired`."""
+    n_led = len(sensor.leds)
+    number = dr.arange(mi.UInt32, n_led * each) // mi.UInt32(dr.opaque(mi.UInt32, each))
+    place = trace.side_by_side(each, n_led)
+    if paired:
+        place = dr.gather(mi.UInt32, place, dr.arange(mi.UInt32, n_led * each) & mi.UInt32(2**32 - 2))
+    return number, trace.evenly(place, start)

@@ -80,6 +80,7 @@ def walk(
     seed: int,
     answers: Answers | None = None,
     scores: Sequence[mi.Float] = (),
+    paired: bool = False,
 ) -> Landed:
     """Follow light through the scene until it has ended.
 
@@ -96,6 +97,8 @@ def walk(
     answers, scores
         Changes of q parameters to tell the derivatives for; q derivatives of the logarithm of the throughput
         to begin with.
+    paired
+        Rays 2k and 2k + 1 make the same random choices.
     """
     n_led, layers, width = len(sensor.leds), basis.layers, sensor.guide.width_mm
     weights = basis.weights()
@@ -104,6 +107,8 @@ def walk(
     faces = Faces(scene, sensor)
     lanes = dr.width(number)
     sequence = dr.arange(mi.UInt64, lanes) + 1
+    if paired:
+        sequence = (dr.arange(mi.UInt64, lanes) >> 1) + 1
     random = mi.PCG32(size=lanes, initstate=dr.opaque(mi.UInt64, seed), initseq=sequence)
     critical = float(np.sqrt(max(1.0 - (sensor.skin.gap_index / sensor.guide.refractive_index) ** 2, 0.0)))
     ended = [mi.Float(0.0) for _ in SINKS]
