@@ -177,7 +177,8 @@ def _lanes(
     """LED of each lane, and its point of the unit 4-cube; the same for two and two lanes if `paired`."""
     n_led = len(sensor.leds)
     number = dr.arange(mi.UInt32, n_led * each) // mi.UInt32(dr.opaque(mi.UInt32, each))
-    place = trace.side_by_side(each, n_led)
-    if paired:
-        place = dr.gather(mi.UInt32, place, dr.arange(mi.UInt32, n_led * each) & mi.UInt32(2**32 - 2))
-    return number, trace.evenly(place, start)
+    if not paired:
+        return number, trace.evenly(trace.side_by_side(each, n_led), start)
+    pairs = trace.side_by_side((each + 1) // 2, 1)
+    within = dr.arange(mi.UInt32, n_led * each) - number * each
+    return number, trace.evenly(dr.gather(mi.UInt32, pairs, within >> 1), start)

@@ -12,13 +12,14 @@ from scenes.skin import Skin
 
 WIDTH = 25.0
 PLACE = (1.0, 0.0)  # of the bump
-SKIN = {"skin.rms_slope": 0.1, "skin.rms_height_um": 0.5, "skin.gap_index": 0.002, "skin.dust": 0.02}
+GAPS = {"skin.rms_height_um": 0.5, "skin.gap_index": 0.002, "skin.dust": 0.02}
 STEPS = {
     "leds.flux_W": 1e-3,
     "leds.exponent": 0.1,
     "leds.along_mm": 0.1,
     "leds.z_mm": 0.3,
-    **SKIN,
+    "skin.rms_slope": 0.1,
+    **GAPS,
     "effective_modulus_kPa": 0.3,
     "pressure": 0.05,
     "bump": 0.05,
@@ -115,25 +116,58 @@ class Means:
 
 
 def apart(found, expected):
-    """Largest difference of two pairs of means, relative to the second."""
+    """Largest difference of the means of two derivatives (seeds, names), relative to the second, (names,)."""
     pairs = ((found.blob, expected.blob), (found.background, expected.background))
-    return np.max([np.abs(one - other) / np.abs(other) for one, other in pairs], axis=0)
+    return np.max([np.abs((a.mean(axis=0) - b.mean(axis=0)) / b.mean(axis=0)) for a, b in pairs], axis=0)
 
 
-def compared(names, seeds, samples):
-    """Means of derivatives (seeds, names), and of differences over whole and half steps; all with common
-    seeds."""
+def hold_choices(monkeypatch):
+    """Let walks make the same random choices whatever the contact is: no Russian roulette, and directions
+    out of the tissue as of Lambertian light. Differences of pictures then have less noise, and no other mean.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    from scenes import trace
+    from scenes.bsdf import Table
+
+    def draw(self, fraction, sample1, sample2, active=True):
+        return mi.warp.square_to_cosine_hemisphere(sample2)
+
+    def density(self, fraction, cosine, active=True):
+        return dr.maximum(cosine, 1e-4) * dr.inv_pi
+
+    monkeypatch.setattr(trace, "_SURE_BOUNCES", 10_000)
+    monkeypatch.setattr(Table, "draw", draw)
+    monkeypatch.setattr(Table, "density", density)
+
+
+def answered(names, seeds, samples):
+    """Means of the derivatives, (seeds, names)."""
     from scenes.gradients import gradients
-    from scenes.render import Renderer
 
-    renderer = Renderer(sensor(), device="cpu")
     asked = parameters(names)
-    found, whole, half = [], [], []
-    for seed in seeds:
-        found.append(gradients(renderer, press(), asked, samples=samples, seed=seed).slopes)
-        whole.append([difference(name, STEPS[name], seed, samples) for name in names])
-        half.append([difference(name, 0.5 * STEPS[name], seed, samples) for name in names])
-    return tuple(Means.of(np.array(one)) for one in (found, whole, half))
+    parts = renderer_of(sensor()), press(), asked
+    return Means.of(np.array([gradients(*parts, samples=samples, seed=seed).slopes for seed in seeds]))
+
+
+def differences(names, seeds, samples, share=1.0):
+    """Means of differences over a share of the steps, (seeds, names)."""
+    return Means.of(
+        np.array([[difference(name, share * STEPS[name], seed, samples) for name in names] for seed in seeds])
+    )
+
+
+def show(names, found, whole, half):
+    """The table: derivatives, differences over whole and half steps, and what they are apart."""
+    for k, name in enumerate(names):
+        for where in ("blob", "background"):
+            ours, steps, halves = (getattr(one, where)[:, k] for one in (found, whole, half))
+            off, middle = ours - halves, halves.mean()
+            said = f"{100 * off.mean() / middle:+.2f}"
+            if len(off) > 1:
+                said += f" ± {100 * off.std(ddof=1) / np.sqrt(len(off)) / abs(middle):.2f}"
+            print(f"{name:22} {where:10} {ours.mean():+.5g} {steps.mean():+.5g} {middle:+.5g} {said} %")
 
 
 def test_the_contact_law_is_differentiated(variant):
@@ -210,6 +244,21 @@ def test_what_a_sensor_has_not_is_refused(variant, parameter, says):
     assert "\n" not in str(refused.value)
 
 
+def test_derivatives_come_with_the_picture(variant):
+    """The picture is the renderer's own, bit for bit; that of the flux is the picture over the flux; every
+    parameter answers."""
+    names = ["leds.flux_W", "leds.z_mm", "skin.rms_slope", "skin.dust"]
+    from scenes.gradients import gradients
+
+    renderer = renderer_of(sensor())
+    found = gradients(renderer, press(), parameters(names), samples=2**10, seed=3)
+    plain = renderer.render(press(), samples=2**10, seed=3).radiance
+    np.testing.assert_array_equal(np.maximum(found.radiance, 0.0).astype(np.float32), plain)
+    np.testing.assert_allclose(found.slopes[0], found.radiance / 0.01, rtol=1e-6)
+    assert np.isfinite(found.slopes).all()
+    assert (np.abs(found.slopes).max(axis=(1, 2, 3)) > 0.0).all()
+
+
 def stage(name):
     """A scene with the press in place, and the slope of its contact fraction on cells to a parameter."""
     from scenes import build, gradients, transport
@@ -277,3 +326,61 @@ def test_the_tissue_is_linearised(variant, name):
         off = np.linalg.norm(getattr(found, one) - expected) / np.linalg.norm(expected)
         print(name, one, "off by", off)
         assert off < 0.02
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_table_of_the_contact(variant, monkeypatch):
+    """Pictures of walks whose choices do not hang on the contact: nothing is left to noise."""
+    from scenes.answers import Answers
+
+    hold_choices(monkeypatch)
+    names = ["skin.rms_slope", "effective_modulus_kPa", "skin.rms_height_um", "skin.dust", "pressure", "bump"]
+    asked, parts = [*names, "skin.gap_index", "height"], (range(1), 2**14)
+    found, whole, half = answered(asked, *parts), differences(asked, *parts), differences(asked, *parts, 0.5)
+    show(asked, found, whole, half)
+    must = slice(0, len(names))  # of the others the differences themselves do not converge
+    assert (apart(whole, half)[must] < 0.01).all()
+    assert (apart(found, half)[must] < 0.005).all()
+    assert (apart(Means(-found.blob, -found.background), half)[must] > 0.005).all()
+    monkeypatch.setattr(Answers, "mirrored", lambda self, table, p, fraction, cosine, active: [0.0 * p.x])
+    for name in ("skin.rms_slope", "bump"):  # light that a contact takes is missed elsewhere
+        k = asked.index(name)
+        there = Means(half.blob[:, k : k + 1], half.background[:, k : k + 1])
+        off = apart(answered([name], *parts), there)[0]
+        print(f"{name} without its scores: apart by {off:.4f}")
+        assert off > 0.005
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_table_of_the_leds(variant, monkeypatch):
+    """Walked light of LEDs that move has the noise of its paths, in both; the rim's light is not left out."""
+    from scenes import followed
+
+    names = ["leds.flux_W", "leds.exponent", "leds.along_mm", "leds.z_mm"]
+    parts = (range(4), 2**18)
+    found, half = answered(names, *parts), differences(names, *parts, 0.5)
+    few = differences(names, range(1), 2**18)
+    show(names, found, few, half)
+    first = Means(half.blob[:1], half.background[:1])
+    print("whole steps against half ones:", apart(few, first))
+    for where in ("blob", "background"):
+        off = getattr(found, where) - getattr(half, where)
+        noise = off.std(axis=0, ddof=1) / np.sqrt(len(off))
+        size = np.abs(getattr(half, where).mean(axis=0))
+        assert (noise < 0.03 * size).all()
+        assert (np.abs(off.mean(axis=0)) < 0.03 * size + 2.0 * noise).all()
+    assert (apart(Means(-found.blob, -found.background), half) > 0.5).all()
+
+    walked = followed._walked
+
+    def without_rim(*given):
+        landed = walked(*given)
+        return replace(landed, slopes=0.0 * landed.slopes) if given[-1] is True else landed
+
+    monkeypatch.setattr(followed, "_walked", without_rim)
+    blind = answered(names[2:], *parts)
+    there = Means(half.blob[:, 2:], half.background[:, 2:])
+    print("without the rim's light apart by", apart(blind, there))
+    assert (apart(blind, there) > 0.1).all()
