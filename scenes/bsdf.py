@@ -5,6 +5,7 @@ Import only after a variant is set (`scenes.backend.use`): Mitsuba binds the cla
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import drjit as dr
@@ -65,6 +66,25 @@ class Table:
         t10, t11 = (dr.gather(mi.Float, self._t, corner + self.columns + k, active) for k in (0, 1))
         low, high = dr.lerp(t00, t01, v), dr.lerp(t10, t11, v)
         return dr.lerp(low, high, u), (high - low) * (self.rows - 1)
+
+    def look_up(
+        self, values: mi.Float, fraction: mi.Float, cosine: mi.Float, active: mi.Bool | bool = True
+    ) -> mi.Float:
+        """Other values on the nodes of the transmittance, between these as that is."""
+        i, u = _cell(fraction, self.rows)
+        j, v = _cell(cosine, self.columns)
+        corner = i * self.columns + j
+        low, high = (
+            dr.lerp(dr.gather(mi.Float, values, at, active), dr.gather(mi.Float, values, at + 1, active), v)
+            for at in (corner, corner + self.columns)
+        )
+        return dr.lerp(low, high, u)
+
+    def moved(self, change: mi.Float) -> Table:
+        """The same with so much more transmittance on its nodes; drawn from is what was."""
+        other = copy.copy(self)
+        other._t = self._t + change
+        return other
 
     def hemispherical(self, fraction: mi.Float, active: mi.Bool | bool = True) -> mi.Float:
         return self._row(self._mean, fraction, active)

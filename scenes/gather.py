@@ -23,6 +23,8 @@ from .sensor import Sensor
 from .tissue import Coupling
 from .view import PixelRays, faces_reflectance
 
+Array = NDArray[np.float64]
+
 _ASIDE_MM = (1.3e-4, 0.7e-4, 0.0)  # along neither the sides nor the diagonals of the mesh
 _SIGHTS = 2  # the surface seen directly, and mirrored once in the lower faces; a third sight adds 1e-5
 
@@ -59,10 +61,35 @@ class Sight:
     lamps: NDArray[np.float32]
 
 
+@dataclass(frozen=True)
+class Glance:
+    """A `Sight` on the device, pixel after pixel; windows are a list of `_SIGHTS`, lamps of LEDs."""
+
+    points: list[tuple[mi.Float, mi.Float, mi.Float]]
+    lean: tuple[mi.Float, mi.Float]
+    off_normal: mi.Float
+    width_mm: float
+    windows: list[mi.Float]
+    lamps: list[mi.Float]
+
+
 def look(scene: mi.Scene, sensor: Sensor, table: Table, coupling: Coupling, rays: PixelRays) -> Sight:
     """Intersect the pixels' rays with the deformed surface."""
+    shape, width = rays.transmittance.shape, sensor.guide.width_mm
+    found = glance(scene, sensor, table, coupling, rays)
+    dr.eval(found.points, found.windows, found.lamps, found.lean, found.off_normal)
+    x, y = (np.asarray(found.points[0][i]).reshape(shape) for i in (0, 1))
+    where = ((np.stack([x, y], axis=-1) - 0.5) * width).astype(np.float32)
+    layers = np.stack(
+        [np.broadcast_to(np.asarray(layer), rays.transmittance.size).reshape(shape) for layer in found.lamps]
+    )
+    through = np.stack([np.asarray(window).reshape(shape) for window in found.windows])
+    return Sight(where, found.points, found.lean, found.off_normal, width, through, layers)
+
+
+def glance(scene: mi.Scene, sensor: Sensor, table: Table, coupling: Coupling, rays: PixelRays) -> Glance:
+    """The same, not evaluated: Dr.Jit differentiates it to the scene's surface and to the table."""
     guide = sensor.guide
-    shape = rays.transmittance.shape
     origin = [mi.Float(rays.origin_mm[..., i].astype(np.float32).ravel()) for i in range(3)]
     direction = mi.Vector3f(*(mi.Float(rays.direction[..., i].astype(np.float32).ravel()) for i in range(3)))
     gain = mi.Float((rays.transmittance * rays.radiance_scale).astype(np.float32).ravel())
@@ -113,15 +140,7 @@ def look(scene: mi.Scene, sensor: Sensor, table: Table, coupling: Coupling, rays
         )
         start += STEP_MM / direction.z * direction
     off_normal = 1.0 - dr.sqrt(dr.maximum(1.0 - coupling.scale * dr.squared_norm(lean), 0.0))
-    dr.eval(points, windows, lamps, lean, off_normal)
-    x, y = (np.asarray(points[0][i]).reshape(shape) for i in (0, 1))
-    position = (np.stack([x, y], axis=-1) - 0.5) * guide.width_mm
-    layers = np.stack(
-        [np.broadcast_to(np.asarray(layer), rays.transmittance.size).reshape(shape) for layer in lamps]
-    )
-    through = np.stack([np.asarray(window).reshape(shape) for window in windows])
-    where = position.astype(np.float32)
-    return Sight(where, points, (bend * lean.x, bend * lean.y), off_normal, guide.width_mm, through, layers)
+    return Glance(points, (bend * lean.x, bend * lean.y), off_normal, guide.width_mm, windows, lamps)
 
 
 def _in_layers(sensor: Sensor, cosine: NDArray[np.float64]) -> list[mi.Float]:
@@ -233,22 +252,58 @@ def picture(sight: Sight, seen: Seen, margin: int, *, lamps: bool = True) -> NDA
     """Radiance in air at the pixels, (n_led, rows, columns), in W m⁻² sr⁻¹; so many cells of what is seen lie
     beside the guide's face on each side. Without the LEDs in sight if not `lamps`.
     """
-    n_led, cells = len(seen.maps), seen.maps.shape[-1]
+    towards = [
+        (dr.opaque(mi.Float, float(away)), dr.opaque(mi.Float, float(more)))
+        for away, more in zip(seen.behind_mm / sight.width_mm, seen.steeper, strict=True)
+    ]
+    total = _layers(sight, seen.maps, towards, margin)
+    dr.eval(total)
+    shape = (len(seen.maps), *sight.position_mm.shape[:2])
+    found = np.stack([np.asarray(layer) for layer in total]).reshape(shape)
+    return np.asarray((found + sight.lamps if lamps else found) * np.float32(1e6))
+
+
+def answer(sight: Glance, step: mi.Float, seen: Seen, slopes: Seen, margin: int) -> Array:
+    """Derivative of the picture, (n_led, pixels), W m⁻² sr⁻¹ per unit of `step`, on which the glance hangs;
+    that of what is seen is in the `slopes`. By Dr.Jit's automatic differentiation, forwards."""
+    width = sight.width_mm
+    towards = [
+        (dr.opaque(mi.Float, float(away)) + step * float(d_away), float(more) + step * float(d_more))
+        for away, more, d_away, d_more in zip(
+            seen.behind_mm / width, seen.steeper, slopes.behind_mm / width, slopes.steeper, strict=True
+        )
+    ]
+    light = _layers(sight, seen.maps, towards, margin)
+    changes = _layers(sight, slopes.maps, towards, margin)
+    pixels = dr.width(sight.off_normal)
+    total = [
+        one + step * change + lamp + dr.zeros(mi.Float, pixels)
+        for one, change, lamp in zip(light, changes, sight.lamps, strict=True)
+    ]
+    dr.forward(step)
+    return np.stack([np.asarray(dr.grad(layer)) for layer in total]).astype(np.float64) * 1e6
+
+
+def _layers(
+    sight: Sight | Glance,
+    maps: NDArray[np.floating],
+    towards: list[tuple[mi.Float, mi.Float]],
+    margin: int,
+) -> list[mi.Float]:
+    """Radiance at the pixels, W mm⁻² sr⁻¹, of each LED's maps (`Seen`); how far behind they are looked up, in
+    units of the guide's width per sine, and how much brighter they are off the normal, are `towards`."""
+    n_led, cells = len(maps), maps.shape[-1]
     inside = 1.0 - 2.0 * margin / cells
     lean = sight.lean
     total = [mi.Float(0.0) for _ in range(n_led)]
     for x, y, gain in sight.points:
-        for led, behind in enumerate(seen.behind_mm / sight.width_mm):
-            away = dr.opaque(mi.Float, float(behind))
+        for led, (away, more) in enumerate(towards):
             place = [
                 inside * (at + away * sine) + margin / cells for at, sine in zip((x, y), lean, strict=True)
             ]
-            found, *aslant = look_up(seen.maps[led], *place)
-            found *= 1.0 + dr.opaque(mi.Float, float(seen.steeper[led])) * sight.off_normal
+            found, *aslant = look_up(maps[led], *place)
+            found *= 1.0 + more * sight.off_normal
             for rise, how in zip(aslant, (sight.off_normal, *lean), strict=False):
                 found += rise * how
             total[led] += gain * found
-    dr.eval(total)
-    shape = (n_led, *sight.position_mm.shape[:2])
-    found = np.stack([np.asarray(layer) for layer in total]).reshape(shape)
-    return np.asarray((found + sight.lamps if lamps else found) * np.float32(1e6))
+    return total

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -53,12 +54,36 @@ class AngularBasis:
         """Maps that light is counted on."""
         return len(self.columns) + sum(2 * len(one.columns) for one in self.turning)
 
+    @property
+    def told(self) -> int:
+        """Those of which derivatives are told."""
+        return self.layers
+
     def weights(self) -> Weights:
         """The columns on the device."""
         return Weights(
             _Columns.of(self.columns),
             tuple((one.harmonic, _Columns.of(one.columns)) for one in self.turning),
         )
+
+
+class Weighing(Protocol):
+    """How much arriving light counts on each map."""
+
+    def at(self, cosine: mi.Float, x: mi.Float, y: mi.Float, active: mi.Bool) -> list[mi.Float]: ...
+
+
+class Layered(Protocol):
+    """Maps that light is counted on, of which derivatives of the first are told: an `AngularBasis`, or
+    several."""
+
+    @property
+    def layers(self) -> int: ...
+
+    @property
+    def told(self) -> int: ...
+
+    def weights(self) -> Weighing: ...
 
 
 @dataclass(frozen=True)

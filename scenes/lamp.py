@@ -6,6 +6,7 @@ towards its upright (+z; +y for LEDs below). Import only after a variant is set 
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 
 import drjit as dr
@@ -33,6 +34,18 @@ class Patterns:
             for number, led in enumerate(leds)
             if led.ies is not None
         }
+
+    def sharper(self, more: mi.Float) -> Patterns:
+        """The same LEDs with so much larger exponents."""
+        other = copy.copy(self)
+        other._exponent = self._exponent + more
+        return other
+
+    def score(self, number: mi.UInt32, cosine: mi.Float) -> mi.Float:
+        """Derivative to the exponent of the logarithm of the density of `draw`, (m+1) cos^m / (2 pi), of LEDs
+        that do not lean."""
+        exponent = dr.gather(mi.Float, self._exponent, number)
+        return dr.rcp(exponent + 1.0) + dr.log(dr.maximum(cosine, 1e-6))
 
     def draw(self, number: mi.UInt32, sample: mi.Point2f) -> mi.Vector3f:
         """Directions as often as the LEDs send light there: along tangent, upright and axis."""

@@ -19,6 +19,7 @@ from .tissue import Coupling
 Array = NDArray[np.float64]
 
 _PADDED = 1.5  # light that has come farther than half the face is left out
+_LEAST = 1e-30  # in place of no light below a fraction bar
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,10 @@ class Glimpse:
 
     spectra: NDArray[np.complex64]
     deep: NDArray[np.complex64]
+
+    def only(self, number: int) -> Glimpse:
+        """That of one source."""
+        return Glimpse(self.spectra[number : number + 1], self.deep[number : number + 1])
 
 
 @dataclass(frozen=True)
@@ -169,15 +174,33 @@ class Passage:
         count = len(glimpses[0].spectra)
         maps, behind = np.empty((count, 4, *self._wide), np.float32), np.empty(count)
         for number in range(count):
-            spectrum = np.sum([one.spectra[number] for one in glimpses], axis=0)
-            deep = np.sum([one.deep[number] for one in glimpses], axis=0)
-            behind[number] = deep[0, 0].real / max(spectrum[0, 0].real, 1e-30)
-            maps[number, 0] = self._back(spectrum)
-            # what is not the same all over
-            deeper = self._back(deep - np.float32(behind[number]) * spectrum)
-            maps[number, 1] = -self.transport_per_mm * deeper
-            maps[number, 3], maps[number, 2] = np.gradient(deeper, self.cell_mm)
+            spectrum, deep = _all(glimpses, number)
+            behind[number] = deep[0, 0].real / max(spectrum[0, 0].real, _LEAST)
+            self._tell(maps[number], spectrum, deep - np.float32(behind[number]) * spectrum)
         return Seen(maps, behind, 1.0 - self.transport_per_mm * behind)
+
+    def change_towards_camera(self, glimpses: Sequence[Glimpse], changes: Sequence[Glimpse]) -> Seen:
+        """Derivative of `towards_camera` where the glimpses change by so much per unit: linear in the light,
+        but for the quotient that `behind_mm` is."""
+        count = len(glimpses[0].spectra)
+        maps, behind = np.empty((count, 4, *self._wide), np.float32), np.empty(count)
+        for number in range(count):
+            (spectrum, deep), (change, deepens) = _all(glimpses, number), _all(changes, number)
+            light = max(spectrum[0, 0].real, _LEAST)
+            now = deep[0, 0].real / light
+            behind[number] = (deepens[0, 0].real - now * change[0, 0].real) / light
+            beyond = deepens - np.float32(now) * change - np.float32(behind[number]) * spectrum
+            self._tell(maps[number], change, beyond)
+        return Seen(maps, behind, -self.transport_per_mm * behind)
+
+    def _tell(
+        self, maps: NDArray[np.float32], spectrum: NDArray[np.complex64], beyond: NDArray[np.complex64]
+    ) -> None:
+        """Fill in the maps of `Seen`, of light and its depth that is not the same all over."""
+        maps[0] = self._back(spectrum)
+        deeper = self._back(beyond)
+        maps[1] = -self.transport_per_mm * deeper
+        maps[3], maps[2] = np.gradient(deeper, self.cell_mm)
 
     @property
     def _wide(self) -> tuple[int, int]:
@@ -198,6 +221,12 @@ class Passage:
         padded, (wide, _) = len(self.shift), self._wide
         rows = scipy.fft.ifft(spectrum, axis=-2, workers=1)[..., :wide, :]
         return np.asarray(scipy.fft.irfft(rows, padded, axis=-1, workers=1)[..., :wide])
+
+
+def _all(glimpses: Sequence[Glimpse], number: int) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
+    """Spectra of one source's light, and of its depths, of all passes together."""
+    spectrum = np.sum([one.spectra[number] for one in glimpses], axis=0)
+    return spectrum, np.sum([one.deep[number] for one in glimpses], axis=0)
 
 
 def _weighed(weights: NDArray[np.float32], fields: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -160,7 +160,7 @@ class Polarised:
         parts = self.scene, self.sensor, self.table, self.under.behind.coupling
         scale = upward[0, :, 0].mean(axis=(1, 2)) * self.sensor.guide.width_mm**2
         per = dr.gather(mi.Float, mi.Float(np.maximum(scale, 1e-30)), number)
-        (ray, plain), (_, polarised) = (trace.re_emit(*parts, one, number, u) for one in upward)
+        (ray, plain, _), (_, polarised, _) = (trace.re_emit(*parts, one, number, u) for one in upward)
         plain, polarised = plain / per, polarised / per
         left = trace.depart(self.scene, self.sensor, self.table, u)
         through = self.table.transmittance(left.fraction, left.cosine, left.meets)

@@ -35,7 +35,7 @@ COLOUR = (
 
 _PATHS_PER_PASS = 2**21  # of all LEDs; independent passes bound the memory and tell the noise
 _LEAST_PASSES = 2
-_MOST_PASSES = 2**14  # so that seeds of passes do not meet
+MOST_PASSES = 2**14  # so that seeds of passes do not meet
 
 
 @dataclass(frozen=True)
@@ -173,8 +173,8 @@ class Renderer:
         build.put_surface(self.scene, self.sensor, shape)
         sight = gather.look(self.scene, self.sensor, self.table, self.behind.coupling, self.rays)
         samples = samples or PATHS_PER_LED[quality]
-        passes = max(_LEAST_PASSES, -(-samples // max(_PATHS_PER_PASS // len(self.sensor.leds), 1)))
-        each, effort = max(-(-samples // passes), 2), _Effort(passes, noise, progress or (lambda done: None))
+        count, each = passes(samples, len(self.sensor.leds))
+        effort = _Effort(count, noise, progress or (lambda done: None))
         if quality == "reference" and traced is None:
             found = self._followed(sight, each, seed, effort, place)
         else:
@@ -223,9 +223,9 @@ class Renderer:
         parts = (self.scene, self.sensor, self.table, under, straight, samples)
 
         def glances() -> Iterator[NDArray[np.floating]]:
-            for number in range(_MOST_PASSES):
+            for number in range(MOST_PASSES):
                 with threadpool_limits(1):
-                    light = transport.transport(*parts, seed * _MOST_PASSES + number, lit)
+                    light = transport.transport(*parts, seed * MOST_PASSES + number, lit)
                     seen = under.glanced(light.upward)
                 found = (light.traced, light.sinks, light.trapped)
                 sums[:] = found if number == 0 else [a + b for a, b in zip(sums, found, strict=True)]
@@ -261,14 +261,20 @@ class Renderer:
 
         def passes() -> Iterator[Array]:
             nonlocal total
-            for number in range(_MOST_PASSES):
-                seen = exact.exact(*parts, seed * _MOST_PASSES + number, place=place)
+            for number in range(MOST_PASSES):
+                seen = exact.exact(*parts, seed * MOST_PASSES + number, place=place)
                 layers = 1e6 * (np.einsum("snyx,syx->nyx", seen, sight.windows) + sight.lamps)
                 total = total + layers
                 yield layers.sum(axis=0)
 
         count, noise = effort.spend(passes())
         return _Found(np.asarray(total) / count, noise)
+
+
+def passes(samples: int, n_led: int) -> tuple[int, int]:
+    """Number of independent passes that so many light paths per LED are followed in, and paths in each."""
+    count = max(_LEAST_PASSES, -(-samples // max(_PATHS_PER_PASS // n_led, 1)))
+    return count, max(-(-samples // count), 2)
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ Import only after a variant is set (`scenes.backend.use`).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -16,10 +17,11 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from .answers import Answers
 from .bsdf import Table
 from .build import led_frame
 from .faces import CONTACT, LAYER, LED, NOTHING, TO_AIR, TO_GLASS, WALL, Faces, Meeting
-from .irradiance import AngularBasis, look_up
+from .irradiance import Layered, look_up
 from .lamp import Patterns
 from .sensor import Sensor
 from .tissue import Coupling
@@ -56,23 +58,29 @@ class Landed:
     trapped : (n_led,)
         Sum of throughput that came to the contact surface for the first time beyond the critical angle to
         the gaps.
+    answers : (q, n_led, told, CELLS, CELLS)
+        Derivatives of the first maps (`Layered.told`) to the q parameters of `Answers`.
     """
 
     maps: Array
     sinks: Array
     trapped: Array
+    answers: Array
 
 
 def walk(
     scene: mi.Scene,
     sensor: Sensor,
     table: Table,
-    basis: AngularBasis,
+    basis: Layered,
     number: mi.UInt32,
     ray: mi.Ray3f,
     throughput: mi.Float,
     leg: mi.UInt32,
     seed: int,
+    answers: Answers | None = None,
+    scores: Sequence[mi.Float] = (),
+    paired: bool = False,
 ) -> Landed:
     """Follow light through the scene until it has ended.
 
@@ -86,23 +94,31 @@ def walk(
         Where it begins, with what weight, and on which leg of the gathered families.
     seed
         The result depends on nothing else, not even on the number of threads.
+    answers, scores
+        Changes of q parameters to tell the derivatives for; q derivatives of the logarithm of the throughput
+        to begin with.
+    paired
+        Rays 2k and 2k + 1 make the same random choices.
     """
     n_led, layers, width = len(sensor.leds), basis.layers, sensor.guide.width_mm
     weights = basis.weights()
-    maps = dr.zeros(mi.Int64, n_led * layers * CELLS * CELLS)
+    many = layers + basis.told * len(scores)
+    maps = dr.zeros(mi.Int64, n_led * many * CELLS * CELLS)
     faces = Faces(scene, sensor)
     lanes = dr.width(number)
     sequence = dr.arange(mi.UInt64, lanes) + 1
+    if paired:
+        sequence = (dr.arange(mi.UInt64, lanes) >> 1) + 1
     random = mi.PCG32(size=lanes, initstate=dr.opaque(mi.UInt64, seed), initseq=sequence)
     critical = float(np.sqrt(max(1.0 - (sensor.skin.gap_index / sensor.guide.refractive_index) ** 2, 0.0)))
     ended = [mi.Float(0.0) for _ in SINKS]
-    state = (ray, throughput, mi.UInt32(0), leg, throughput > 0.0, random, mi.Float(-1.0), *ended)
+    state = (ray, throughput, mi.UInt32(0), leg, throughput > 0.0, random, mi.Float(-1.0), *ended, *scores)
 
     def going(ray, throughput, bounce, leg, alive, random, trapped, *ended):  # type: ignore[no-untyped-def]
         return alive
 
     def step(ray, throughput, bounce, leg, alive, random, trapped, *ended):  # type: ignore[no-untyped-def]
-        sink = dict(zip(SINKS, ended, strict=True))
+        sink, scores = dict(zip(SINKS, ended, strict=False)), list(ended[len(SINKS) :])
         met = faces.meet(ray, alive)
         for medium, lost in absorb(sensor, ray, met, throughput).items():
             sink[medium] += lost
@@ -120,15 +136,20 @@ def walk(
         lands = on_contact & ~gathered & (met.n.z < -0.5)
         column = mi.UInt32(dr.clip((met.p.x / width + 0.5) * CELLS, 0.0, CELLS - 1.0))
         row = mi.UInt32(dr.clip((met.p.y / width + 0.5) * CELLS, 0.0, CELLS - 1.0))
-        cell = ((number * CELLS + row) * CELLS + column) * layers  # layers side by side: one place in memory
-        for k, weight in enumerate(weights.at(cosine, ray.d.x, ray.d.y, lands)):
-            amount = mi.Int64(dr.round(throughput * weight * _FIXED_POINT))
-            dr.scatter_add(maps, amount, cell + k, lands)
+        cell = ((number * CELLS + row) * CELLS + column) * many  # layers side by side: one place in memory
+        weighed = [throughput * weight for weight in weights.at(cosine, ray.d.x, ray.d.y, lands)]
+        for k, amount in enumerate(weighed):
+            dr.scatter_add(maps, mi.Int64(dr.round(amount * _FIXED_POINT)), cell + k, lands)
+        if scores:
+            _add_scored(maps, weighed[: basis.told], scores, cell + layers, lands)
         trapped = dr.select(
             on_contact & (trapped < 0.0), dr.select(cosine < critical, throughput, 0.0), trapped
         )
 
         through = table.transmittance(met.fraction, cosine, on_contact)
+        if answers is not None:
+            turned = answers.mirrored(table, met.p, met.fraction, cosine, on_contact)
+            scores = [score + more for score, more in zip(scores, turned, strict=True)]
         entering = dr.select(on_contact, throughput * through, 0.0)
         sink["tissue"] += entering
         elsewhere = alive & ~on_contact
@@ -147,7 +168,8 @@ def walk(
         survive = dr.select(bounce < _SURE_BOUNCES, 1.0, dr.minimum(kept, 0.95))
         alive = alive & (kept > 0.0) & (random.next_float32() < survive) & (bounce < _MAX_BOUNCES)
         throughput = dr.select(alive, kept / survive, 0.0)
-        return met.leaving(direction), throughput, bounce + 1, leg, alive, random, trapped, *sink.values()
+        rest = (*sink.values(), *scores)
+        return met.leaving(direction), throughput, bounce + 1, leg, alive, random, trapped, *rest
 
     end = dr.while_loop(state, going, step)
 
@@ -155,16 +177,39 @@ def walk(
         return np.asarray(values, dtype=np.float64).reshape(n_led, -1).sum(axis=1)
 
     dr.eval(maps, end[6:])
-    counted = maps.numpy().reshape(n_led, CELLS, CELLS, layers)
+    counted = maps.numpy().reshape(n_led, CELLS, CELLS, many)
+    landed = np.ascontiguousarray(np.moveaxis(counted, -1, 1)) / _FIXED_POINT
+    sinks = end[7 : 7 + len(SINKS)]
     return Landed(
-        np.ascontiguousarray(np.moveaxis(counted, -1, 1)) / _FIXED_POINT,
-        np.stack([per_led(amount + dr.zeros(mi.Float, lanes)) for amount in end[7:]], axis=1),
+        landed[:, :layers],
+        np.stack([per_led(amount + dr.zeros(mi.Float, lanes)) for amount in sinks], axis=1),
         per_led(dr.maximum(end[6], 0.0)),
+        np.moveaxis(landed[:, layers:].reshape(n_led, -1, basis.told, CELLS, CELLS), 1, 0),
     )
 
 
-def emit(sensor: Sensor, number: mi.UInt32, u: list[mi.Float]) -> mi.Ray3f:
-    """Rays from the LEDs' discs, even over area, over angle as their patterns say."""
+def _add_scored(
+    maps: mi.Int64, weighed: list[mi.Float], scores: list[mi.Float], cell: mi.UInt32, active: mi.Bool
+) -> None:
+    """Add amounts times each score, one after the other; in a loop, as the code would be long."""
+
+    def more(number: mi.UInt32) -> mi.Bool:
+        return active & (number < len(scores))
+
+    def add(number: mi.UInt32) -> tuple[mi.UInt32]:
+        score = sum((dr.select(number == q, one, 0.0) for q, one in enumerate(scores)), mi.Float(0.0))
+        start = cell + number * len(weighed)
+        for k, amount in enumerate(weighed):
+            scored = mi.Int64(dr.round(amount * score * _FIXED_POINT))
+            dr.scatter_add(maps, scored, start + k, number < len(scores))
+        return (number + 1,)
+
+    dr.while_loop((dr.zeros(mi.UInt32, dr.width(cell)),), more, add)
+
+
+def emit(sensor: Sensor, number: mi.UInt32, u: list[mi.Float], *, rim: bool = False) -> mi.Ray3f:
+    """Rays from the LEDs' discs, even over area, or only from their `rim`; over angle as their patterns
+    say."""
     half, floor = sensor.guide.width_mm / 2, -sensor.guide.thickness_mm - sensor.glass.thickness_mm
     frames = np.array([np.concatenate(led_frame(led, half, floor)) for led in sensor.leds])
     radii = np.array([led.diameter_mm / 2 for led in sensor.leds])
@@ -174,6 +219,8 @@ def emit(sensor: Sensor, number: mi.UInt32, u: list[mi.Float]) -> mi.Ray3f:
     )
     radius = dr.gather(mi.Float, columns[9], number)
     on_disc = mi.warp.square_to_uniform_disk_concentric(mi.Point2f(u[0], u[1]))
+    if rim:
+        on_disc = mi.Point2f(*reversed(dr.sincos(dr.two_pi * u[0])))
     patterns = Patterns(sensor.leds)
     direction = patterns.draw(number, mi.Point2f(u[2], u[3]))
     if not patterns.lambertian:  # their y is the LED's upright, this frame's t that or its opposite
@@ -193,37 +240,52 @@ def re_emit(
     upward: Array,
     number: mi.UInt32,
     u: list[mi.Float],
-) -> tuple[mi.Ray3f, mi.Float]:
-    """Rays from the contact surface as the tissue re-emits light, and what each carries, times their number.
+    answers: Answers | None = None,
+    slopes: Sequence[Array] = (),
+) -> tuple[mi.Ray3f, mi.Float, list[mi.Float]]:
+    """Rays from the contact surface as the tissue re-emits light; what each carries, times their number; and
+    its scores to the parameters of `answers`, of which ``slopes`` are the derivatives of `upward`.
 
     Even over the guide's face, directions as T(cos) cos, weight as L = (n1/n3)² T sum phi_i(cos) V_i / pi;
     `upward` is V (n_led, modes, m, m), W/mm², on cells [iy, ix] of the guide's face.
     """
     left = depart(scene, sensor, table, u)
     n_led, modes = upward.shape[:2]
-    layers = look_up(upward.reshape(n_led * modes, *upward.shape[2:]), u[0], u[1])
     lobes = table.lobes(left.cosine, left.meets)
-    brightness = mi.Float(0.0)
-    for led in range(n_led):
-        here = sum(lobe * layers[led * modes + i] for i, lobe in enumerate(lobes))
-        brightness = dr.select(number == led, here, brightness)
-    width, cosine = sensor.guide.width_mm, left.cosine
-    lobe = coupling.scale * width**2 * table.transmittance(left.fraction, cosine, left.meets)
-    lobe = lobe * cosine * dr.inv_pi
-    brightness *= lobe / table.density(left.fraction, cosine, left.meets)
-    return left.ray, dr.select(left.meets, dr.maximum(brightness, 0.0), 0.0)
+
+    def bright(upward: Array) -> mi.Float:
+        layers = look_up(upward.reshape(n_led * modes, *upward.shape[2:]), u[0], u[1])
+        found = mi.Float(0.0)
+        for led in range(n_led):
+            here = sum(lobe * layers[led * modes + i] for i, lobe in enumerate(lobes))
+            found = dr.select(number == led, here, found)
+        return found
+
+    brightness = bright(upward)
+    scores: list[mi.Float] = []
+    if answers is not None:
+        passed = answers.passed(table, left.place, left.fraction, left.cosine, left.meets)
+        scores = [
+            score + dr.select(brightness > 0.0, bright(slope) / brightness, 0.0)
+            for score, slope in zip(passed, slopes, strict=True)
+        ]
+    here = left.fraction, left.cosine, left.meets
+    lobe = coupling.scale * sensor.guide.width_mm**2 * table.transmittance(*here)
+    brightness *= lobe * left.cosine * dr.inv_pi / table.density(*here)
+    return left.ray, dr.select(left.meets, dr.maximum(brightness, 0.0), 0.0), scores
 
 
 @dataclass(frozen=True)
 class Departure:
     """Rays that leave the contact surface: whether it `meets` the place at all, contact fraction, cosine and
-    normal there, and the ray."""
+    normal there, the ray, and the place."""
 
     meets: mi.Bool
     fraction: mi.Float
     cosine: mi.Float
     normal: mi.Vector3f
     ray: mi.Ray3f
+    place: mi.Point3f
 
 
 def depart(scene: mi.Scene, sensor: Sensor, table: Table, u: list[mi.Float]) -> Departure:
@@ -240,7 +302,7 @@ def depart(scene: mi.Scene, sensor: Sensor, table: Table, u: list[mi.Float]) -> 
     digits = u[0] * 4096.0
     direction = table.draw(fraction, digits - dr.floor(digits), mi.Point2f(u[2], u[3]), meets)
     cosine = mi.Frame3f.cos_theta(direction)
-    return Departure(meets, fraction, cosine, si.sh_frame.n, si.spawn_ray(si.to_world(direction)))
+    return Departure(meets, fraction, cosine, si.sh_frame.n, si.spawn_ray(si.to_world(direction)), si.p)
 
 
 def side_by_side(each: int, n_led: int) -> mi.UInt32:

@@ -28,8 +28,8 @@ Singles = NDArray[np.float32]
 GRID = 200  # cells of the maps per side
 MARGIN = 30  # cells beside them, in which light comes out of bare skin
 INSIDE = slice(MARGIN, MARGIN + GRID)
-_ORDERS = 12  # of re-emission at most
-_ENOUGH = 3e-3  # share of the light below which the orders to come are estimated
+ORDERS = 12  # of re-emission at most
+ENOUGH = 3e-3  # share of the light below which the orders to come are estimated
 
 
 @dataclass(frozen=True)
@@ -89,6 +89,12 @@ class Light:
 
 def survey(scene: mi.Scene, sensor: Sensor) -> Ground:
     """Look at the deformed surface from below, cell by cell."""
+    found = [np.asarray(values).reshape(GRID, GRID) for values in glance(scene, sensor)]
+    return Ground(found[0].astype(np.float64), found[1].astype(bool))
+
+
+def glance(scene: mi.Scene, sensor: Sensor) -> tuple[mi.Float, mi.Bool]:
+    """The same on the device, cell after cell: Dr.Jit differentiates it to the scene's surface."""
     width = sensor.guide.width_mm
     middles = (np.arange(GRID) + 0.5) / GRID * width - width / 2
     x, y = (mi.Float(values.ravel().astype(np.float32)) for values in np.meshgrid(middles, middles))
@@ -97,8 +103,7 @@ def survey(scene: mi.Scene, sensor: Sensor) -> Ground:
     si = meet(scene, mi.ShapePtr(contact), mi.Point3f(x, y, height), mi.Vector3f(0.0, 0.0, 1.0))
     meets = si.is_valid() & (si.shape == mi.ShapePtr(contact))
     fraction = dr.select(meets, contact.eval_attribute_1("vertex_contact_fraction", si, meets), 0.0)
-    found = [np.asarray(values).reshape(GRID, GRID) for values in (fraction, meets)]
-    return Ground(found[0].astype(np.float64), found[1].astype(bool))
+    return fraction, meets
 
 
 def transport(
@@ -130,18 +135,18 @@ def transport(
     n_led = len(sensor.leds)
     basis, behind = under.entrance.basis, under.behind
     flux = np.array([led.flux_W for led in sensor.leds])
-    starts = np.random.Generator(np.random.Philox(seed)).integers(0, 2**32, size=(_ORDERS + 1, 4))
+    starts = np.random.Generator(np.random.Philox(seed)).integers(0, 2**32, size=(ORDERS + 1, 4))
 
     def walk(order: int, each: int, upward: Array | None) -> tuple[Singles, Array, Array, Array]:
         index = dr.arange(mi.UInt32, n_led * each)
         number = index // mi.UInt32(dr.opaque(mi.UInt32, each))
         u = trace.evenly(trace.side_by_side(each, n_led), starts[order])
         if upward is None:
-            legs = [_first_leg(led) for led in sensor.leds]
+            legs = [first_leg(led) for led in sensor.leds]
             leg = dr.gather(mi.UInt32, mi.UInt32(np.array(legs, dtype=np.uint32)), number)
             ray, amount, scale = trace.emit(sensor, number, u), dr.full(mi.Float, 1.0, n_led * each), flux
         else:
-            ray, amount = trace.re_emit(scene, sensor, table, behind.coupling, upward, number, u)
+            ray, amount, _ = trace.re_emit(scene, sensor, table, behind.coupling, upward, number, u)
             scale = upward[:, 0].mean(axis=(1, 2)) * sensor.guide.width_mm**2
             amount /= dr.gather(mi.Float, mi.Float(np.maximum(scale, 1e-30)), number)
             leg = mi.UInt32(trace.OTHER)
@@ -158,9 +163,9 @@ def transport(
     landed = traced
     total = newest = under.again(traced) + (under.upward(straight) if lit is None else lit)
     ratio = np.ones(n_led)
-    for order in range(1, _ORDERS + 1):
+    for order in range(1, ORDERS + 1):
         before = newest[:, 0].sum(axis=(1, 2))
-        if (before * ratio).sum() <= _ENOUGH * total[:, 0].sum():
+        if (before * ratio).sum() <= ENOUGH * total[:, 0].sum():
             break
         maps, more, _, begun = walk(order, max(each >> min(2 * order, 6), 2), newest)
         sinks = sinks + more
@@ -175,7 +180,7 @@ def transport(
     return Light(total + newest * rest, sinks, trapped, traced + landed * rest.astype(np.float32))
 
 
-def _first_leg(led: Led) -> int:
+def first_leg(led: Led) -> int:
     """Light from below belongs to no gathered family."""
     if led.side == "below":
         return trace.OTHER
