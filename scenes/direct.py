@@ -33,7 +33,7 @@ _NEWTON_STEPS = 7  # from a guess
 _NEWTON_AGAIN = 1, 2  # from what the disc's point before foretold, if there are so many points, or fewer
 _DIRECTIONS = 24  # of a disc: neighbouring points' light counts as coming from its mean direction
 _FINER = 4  # times the points
-_NEWTON_LAYERS = 3  # in a guide of layers, whose faces a disc may cross
+_NEWTON_LAYERS = 5  # in a guide of layers, whose faces a disc may cross
 _LEAST_MM = 1e-3  # of the height in the entered layer: where a disc's point lies in another, no light enters
 
 
