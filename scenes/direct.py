@@ -29,7 +29,7 @@ DISC_POINTS = 96
 _NEWTON_AGAIN = 1, 2  # from what the disc's point before foretold, if there are so many points, or fewer
 _DIRECTIONS = 24  # of a disc: neighbouring points' light counts as coming from its mean direction
 _FINER = 4  # times the points
-_NEWTON_LAYERS = 3  # in a guide of layers, whose faces a disc may cross
+_NEWTON_LAYERS = 5  # in a guide of layers, whose faces a disc may cross
 
 
 def relief(sensor: Sensor, deformed: OpticalSurface) -> Array:

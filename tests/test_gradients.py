@@ -8,6 +8,7 @@ import pytest
 from sensors import paper_sensor, pressed
 
 from scenes.contact import contact_fraction
+from scenes.sensor import Lower
 from scenes.skin import Skin
 
 WIDTH = 25.0
@@ -191,18 +192,24 @@ def test_the_contact_law_is_differentiated(variant):
         np.testing.assert_allclose(found[inside], ((high - low) / (2 * step))[inside], atol=1e-8)
 
 
-def test_gathered_light_is_differentiated_through_its_loop(variant):
+@pytest.mark.parametrize(
+    ("lower", "names"),
+    [((), (*list(STEPS)[1:4], "height")), ((Lower(5.0, 1.5),), ("leds.along_mm", "height"))],
+)
+def test_gathered_light_is_differentiated_through_its_loops(variant, lower, names):
     """Dr.Jit's derivatives of irradiance on the contact, to an LED's place and pattern and to the relief,
     against differences; away from the rim beside the LEDs, where light has edges."""
     from scenes import direct
     from scenes.irradiance import AngularBasis
 
-    one, ground = sensor(), direct.relief(sensor(), press())
+    ground = direct.relief(sensor(), press())
+    one = replace(sensor(), guide=replace(sensor().guide, lower=lower))
     everything = AngularBasis(np.ones((1, 2, 1)), np.ones((1, 2)))
     rise = direct.relief(one, press(height=1.0)) - ground
 
     def light(name="leds.z_mm", off=0.0, ground=ground):
-        return direct.on(moved(name, off)[0], everything, ground)[:, 0, 40:160, 40:160]
+        there = replace(moved(name, off)[0], guide=one.guide)
+        return direct.on(there, everything, ground)[:, 0, 40:160, 40:160]
 
     cases = {
         "leds.along_mm": direct.Change(along_mm=1.0),
@@ -210,16 +217,19 @@ def test_gathered_light_is_differentiated_through_its_loop(variant):
         "leds.exponent": direct.Change(exponent=1.0),
         "height": direct.Change(ground=rise),
     }
-    for name, change in cases.items():
-        found = direct.answers(one, everything, ground, change)[:, 0, 40:160, 40:160]
+    for name in names:
+        found = direct.answers(one, everything, ground, cases[name])[:, 0, 40:160, 40:160]
         step = 0.1 if name == "height" else 0.02  # far above the rounding of single precision
         low, high = (
             light(ground=ground + off * rise) if name == "height" else light(name, off)
             for off in (-step, step)
         )
         expected = (high - low) / (2 * step)
-        assert np.linalg.norm(found - expected) < 0.01 * np.linalg.norm(expected), name
-        assert np.linalg.norm(-found - expected) > np.linalg.norm(expected), name
+        # a face between layers cuts off whole points of a disc here and there: in differences that is noise
+        size = (lambda maps: np.median(np.abs(maps))) if lower else np.linalg.norm
+        print(name, "off by", size(found - expected) / size(expected))
+        assert size(found - expected) < (0.001 if lower else 0.01) * size(expected), name
+        assert size(-found - expected) > size(expected), name
 
 
 @pytest.mark.parametrize(
@@ -321,18 +331,12 @@ def test_the_tissue_is_linearised(variant, name):
     step = 0.01 / np.abs(slope).max()
     low, high = seen(-step), seen(step)
     np.testing.assert_allclose(middle.maps, seen(0.0).maps, rtol=1e-5, atol=1e-6 * middle.maps.max())
-    names = ("along the normal", "more off it", "towards +x", "towards +y", "behind_mm", "steeper")
-    parts = zip(names, _parts(found), _parts(low), _parts(high), strict=True)
-    for one, ours, before, after in parts:
+    parts = ([*np.moveaxis(one.maps, 1, 0), one.behind_mm, one.steeper] for one in (found, low, high))
+    for number, (ours, before, after) in enumerate(zip(*parts, strict=True)):
         expected = (after - before) / (2 * step)
         off = np.linalg.norm(ours - expected) / np.linalg.norm(expected)
-        print(name, one, "off by", off)
+        print(name, number, "off by", off)
         assert off < 0.02
-
-
-def _parts(seen):
-    """The maps of what is seen one by one, and how it leans."""
-    return [*np.moveaxis(seen.maps, 1, 0), seen.behind_mm, seen.steeper]
 
 
 @pytest.mark.slow

@@ -1,5 +1,7 @@
 """Layout studies: what is refused, in one line; what fields mean; what kind each one is."""
 
+from dataclasses import replace
+
 import pytest
 
 import twin
@@ -115,6 +117,15 @@ def test_fields_make_the_sensor_that_they_say():
     assert on_x == pytest.approx([-6.25, 6.25])
     with pytest.raises(DesignError, match="z_mm"):
         layout_fields.layout(study, design, {"leds.*.z_mm": -9.9})
+
+
+def test_layers_of_their_own_index_are_not_dropped_in_silence():
+    design = twin.load_design("tsis")
+    first, *rest = design.waveguide.layers
+    own = replace(first, refractive_index=1.42)
+    base = replace(design, waveguide=replace(design.waveguide, layers=(own, *rest)))
+    with pytest.raises(DesignError, match=r"fields\.layout\.layers: .*indices of their own"):
+        layout_fields.changed_design(base, {"layout.layers": [[5.0, 20.0]]}, "fields")
 
 
 def test_a_written_design_is_read_as_it_was():

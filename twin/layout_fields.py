@@ -230,7 +230,10 @@ def _arrange(tables: dict[str, Any], name: str, fields: Mapping[str, Any]) -> No
         rows = np.asarray(value, dtype=object)
         if rows.ndim != 2 or rows.shape[1] != 2:
             raise DesignError(where, shown(value), "a list of [thickness in mm, modulus in kPa]")
-        poisson = tables["waveguide"]["layers"][0]["poisson"]
+        before = tables["waveguide"]["layers"]
+        if any(layer.get("refractive_index") is not None for layer in before):
+            raise DesignError(where, shown(value), "no layers where the base's have indices of their own")
+        poisson = before[0]["poisson"]
         tables["waveguide"]["layers"] = [
             {"thickness_mm": thickness, "modulus_kPa": modulus, "poisson": poisson}
             for thickness, modulus in value
