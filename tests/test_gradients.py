@@ -257,7 +257,7 @@ def test_what_a_sensor_has_not_is_refused(variant, parameter, says):
 def test_derivatives_come_with_the_picture(variant):
     """The picture is the renderer's own, bit for bit; that of the flux is the picture over the flux; every
     parameter answers."""
-    names = ["leds.flux_W", "leds.z_mm", "skin.rms_slope", "skin.dust"]
+    names = ["leds.flux_W", "skin.rms_slope"]
     from scenes.gradients import gradients
 
     renderer = renderer_of(sensor())
@@ -380,8 +380,8 @@ def test_table_of_the_leds(variant, monkeypatch):
         off = getattr(found, where) - getattr(half, where)
         noise = off.std(axis=0, ddof=1) / np.sqrt(len(off))
         size = np.abs(getattr(half, where).mean(axis=0))
-        assert (noise < 0.03 * size).all()
-        assert (np.abs(off.mean(axis=0)) < 0.03 * size + 2.0 * noise).all()
+        assert (noise < 0.04 * size).all()
+        assert (np.abs(off.mean(axis=0)) < 0.03 * size).all()
     assert (apart(Means(-found.blob, -found.background), half) > 0.5).all()
 
     walked = followed._walked
