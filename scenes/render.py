@@ -115,6 +115,7 @@ class Renderer:
         self.table = Table(self.packed)
         self.scene = build.load_scene(sensor, self.packed)
 
+    @backend.flushing()
     def render(
         self,
         pressed: pv.PolyData | surface.OpticalSurface,

@@ -72,10 +72,10 @@ def test_noise_does_not_pass_for_information() -> None:
     Noisy.share = 4.0
     try:
         one = follower(Noisy)
-        for _ in range(12):
+        for _ in range(16):
             one.again()
         press = 0, (0.0, 0.0), 2.0
-        slopes = np.mean([one._light(press, seed)[1] for seed in range(12)], axis=0)
+        slopes = np.mean([one._light(press, seed)[1] for seed in range(16)], axis=0)
     finally:
         Noisy.share = 0.0
     found = one.answers
