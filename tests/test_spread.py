@@ -145,13 +145,13 @@ def test_light_enters_and_leaves_a_thin_white_sheet_at_the_same_place() -> None:
 
 
 def test_four_leds_take_well_under_a_tenth_of_a_second() -> None:
-    """m = 200; the fastest of five, so that a busy machine does not decide."""
+    """m = 200; time of the processor, the fastest of twenty, so that a busy machine does not decide."""
     _, _, _, spread = setting(cells=200)
     light, fraction = np.random.default_rng(4).random((4, 2, 200, 200)), patchy(200)
 
     def seconds() -> float:
-        start = time.perf_counter()
+        start = time.process_time()
         spread.solve(light, fraction)
-        return time.perf_counter() - start
+        return time.process_time() - start
 
-    assert min(seconds() for _ in range(5)) < 0.1
+    assert min(seconds() for _ in range(20)) < 0.1
