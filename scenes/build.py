@@ -13,6 +13,7 @@ import numpy as np
 
 from . import (
     bsdf,  # noqa: F401  registers the BSDF
+    housing,
     pinhole,
     surface,
 )
@@ -53,8 +54,8 @@ def load_scene(sensor: Sensor, table: mi.TensorXf) -> mi.Scene:
     The contact surface is the mesh with id `contact`; LED number i is the shape with id `led_i`. Media are
     separated by single faces: guide to air (side walls), guide to glass, glass to air, and `layer_i` over the
     guide's layer i, counted from 0, whose walls are `wall_+x_i` and so on. The glass's rim is
-    held in a black frame and nothing surrounds the sensor (a black housing). Side walls stay flat: their
-    bulge under load, 0.1 mm, is left out.
+    held in a black frame; below it lies a housing that reflects (`housing_floor` and so on), or nothing: a
+    black one. Side walls stay flat: their bulge under load, 0.1 mm, is left out.
     """
     scene = describe(sensor, _contact_mesh(sensor, table))
     return mi.load_dict(scene, optimize=False)  # merging would lose the walls' names
@@ -84,7 +85,7 @@ def describe(sensor: Sensor, contact: mi.Mesh | dict[str, Any]) -> dict[str, Any
         for side, outward in _OUTWARD.items():
             wall = _side_wall(sensor, indices[k])
             scene[f"wall_{side}_{k}"] = _wall(half, floors[k], floors[k - 1], outward, wall)
-    return scene
+    return scene | housing.describe(sensor)
 
 
 def _side_wall(sensor: Sensor, index: float) -> dict[str, Any]:
@@ -113,9 +114,9 @@ def put_surface(scene: mi.Scene, sensor: Sensor, deformed: surface.OpticalSurfac
         raise ValueError(
             f"deformed: received {deformed.nodes_mm.size} nodes per side; allowed {surface.NODES}"
         )
-    parameters["contact.vertex_positions"] = _flat(mesh.vertices)
-    parameters["contact.vertex_normals"] = _flat(mesh.vertex_normals)
-    parameters["contact.vertex_contact_fraction"] = _flat(_fraction(sensor, deformed))
+    parameters["contact.vertex_positions"] = floats(mesh.vertices)
+    parameters["contact.vertex_normals"] = floats(mesh.vertex_normals)
+    parameters["contact.vertex_contact_fraction"] = floats(_fraction(sensor, deformed))
     parameters.update()
 
 
@@ -170,8 +171,8 @@ def _contact_mesh(sensor: Sensor, table: mi.TensorXf) -> mi.Mesh:
     mesh.add_attribute("vertex_contact_fraction", 1, np.zeros(len(shape.vertices), dtype=np.float32))
     parameters = mi.traverse(mesh)
     parameters["faces"] = mi.UInt32(np.ascontiguousarray(shape.faces, dtype=np.uint32).ravel())
-    parameters["vertex_positions"] = _flat(shape.vertices)
-    parameters["vertex_normals"] = _flat(shape.vertex_normals)
+    parameters["vertex_positions"] = floats(shape.vertices)
+    parameters["vertex_normals"] = floats(shape.vertex_normals)
     parameters.update()
     return mesh
 
@@ -181,7 +182,8 @@ def _fraction(sensor: Sensor, deformed: surface.OpticalSurface) -> np.ndarray:
     return surface.with_skirt(fraction)
 
 
-def _flat(values: np.ndarray) -> mi.Float:
+def floats(values: np.ndarray) -> mi.Float:
+    """On the device, in single precision, flat."""
     return mi.Float(np.ascontiguousarray(values, dtype=np.float32).ravel())
 
 

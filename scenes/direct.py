@@ -16,13 +16,15 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from .disc_rays import Source, arrives, first_guess, floats
+from .build import floats
+from .disc_rays import Source, arrives, first_guess
 from .irradiance import Layered
 from .sensor import Sensor
 from .sunflower import disc_points
 from .surface import OpticalSurface, heights
 
 Array = NDArray[np.float64]
+Singles = NDArray[np.float32]
 
 CELLS = 200  # of the grid of target points, per side
 DISC_POINTS = 96
@@ -41,12 +43,12 @@ def relief(sensor: Sensor, deformed: OpticalSurface) -> Array:
     return np.stack([height, slope_x, slope_y])
 
 
-def direct(sensor: Sensor, basis: Layered, deformed: OpticalSurface) -> Array:
+def direct(sensor: Sensor, basis: Layered, deformed: OpticalSurface) -> Singles:
     """Weighted irradiance of the two families, (n_led, layers, CELLS, CELLS), W/mm²; see `on`."""
     return on(sensor, basis, relief(sensor, deformed))
 
 
-def on(sensor: Sensor, basis: Layered, ground: Array, points: int = DISC_POINTS) -> Array:
+def on(sensor: Sensor, basis: Layered, ground: Array, points: int = DISC_POINTS) -> Singles:
     """Weighted irradiance of the two families on a `relief`, (n_led, layers, CELLS, CELLS), W/mm²,
     from so many points of each disc, four times as many where one lies across a face between layers.
 
@@ -59,7 +61,7 @@ def on(sensor: Sensor, basis: Layered, ground: Array, points: int = DISC_POINTS)
     n_led = len(sensor.leds)
     here = [number for number, led in enumerate(sensor.leds) if led.side != "below" and led.flux_W > 0.0]
     if len(here) < n_led:  # light from below crosses both faces at once: it is traced
-        found = np.zeros((n_led, basis.layers, CELLS, CELLS))
+        found = np.zeros((n_led, basis.layers, CELLS, CELLS), np.float32)
         if here:
             some = replace(sensor, leds=tuple(sensor.leds[number] for number in here))
             found[here] = on(some, basis, ground, points)
@@ -67,7 +69,7 @@ def on(sensor: Sensor, basis: Layered, ground: Array, points: int = DISC_POINTS)
     led, where = _targets(sensor, ground)
     total, count = _summed(sensor, basis, _sources(sensor, led), where, points)
     dr.eval(total)
-    return _maps(total, n_led) / count
+    return _maps(total, n_led) / np.float32(count)
 
 
 def answers(
@@ -143,9 +145,8 @@ def _moved(source: Source, change: Change, step: mi.Float) -> Source:
     return replace(source, **moved)
 
 
-def _maps(total: list[mi.Float], n_led: int) -> Array:
-    layers = np.stack([np.asarray(layer).reshape(n_led, CELLS, CELLS) for layer in total], axis=1)
-    return layers.astype(np.float64)
+def _maps(total: list[mi.Float], n_led: int) -> Singles:
+    return np.stack([np.asarray(layer).reshape(n_led, CELLS, CELLS) for layer in total], axis=1)
 
 
 def _summed(

@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .build import led_frame
+from .build import floats, led_frame
 from .lamp import Patterns
 from .sensor import Sensor
 from .stack import Leg, Way, risen, steepness
@@ -262,8 +262,3 @@ def _fresnel(n_in: mi.Float, n_out: mi.Float, tangential2: mi.Float) -> mi.Float
         dr.square(n_out) * a + dr.square(n_in) * b, 1e-12
     )
     return dr.select(total, 1.0, 0.5 * (dr.square(s) + dr.square(p)))
-
-
-def floats(values: np.ndarray) -> mi.Float:
-    """On the device, in single precision."""
-    return mi.Float(np.ascontiguousarray(values, dtype=np.float32).ravel())

@@ -17,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from . import trace, wander
+from . import recurrence, trace, wander
 from .bsdf import Table
-from .faces import CONTACT, NOTHING, Faces
+from .faces import CONTACT, HOUSING, NOTHING, Faces
+from .housing import Tally
 from .sensor import Sensor
 from .view import PixelRays, below_mm
 
@@ -148,6 +149,7 @@ def exact(
     local: bool = False,
     slopes: Array | None = None,
     place: tuple[Array, Array] | None = None,
+    tally: Tally | None = None,
 ) -> Array:
     """What the camera sees directly, and mirrored once in the lower faces, without the ways between.
 
@@ -167,6 +169,8 @@ def exact(
         the paths' scores (`wander.Spots`). Not with `local`.
     place
         Centre (3,) and axes (3, 3), mm, of an ellipsoid of `sensor.inclusion` in the tissue (`wander.Lump`).
+    tally
+        Counts the light that falls on the housing, in units of that of one path.
 
     Returns
     -------
@@ -191,7 +195,7 @@ def exact(
 
     index = dr.arange(mi.UInt32, n_led * samples)
     number = index // mi.UInt32(dr.opaque(mi.UInt32, samples))
-    place = trace.side_by_side(samples, n_led)
+    place = recurrence.side_by_side(samples, n_led)
     starts = np.random.Generator(np.random.Philox(seed)).integers(0, 2**32, size=4)
     sequence = dr.arange(mi.UInt64, n_led * samples) + 1
     random = mi.PCG32(size=n_led * samples, initstate=dr.opaque(mi.UInt64, seed), initseq=sequence)
@@ -205,6 +209,8 @@ def exact(
             throughput = throughput - lost
         alive = alive & (met.kind != NOTHING)
         touches = alive & (met.kind == CONTACT) & (met.cosine > 0.0)
+        if tally is not None:
+            tally.add(number, met.p, throughput, alive & (met.kind == HOUSING))
         u1, u2 = random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32())
         direction, share = trace.bounce_off(sensor, faces, met, alive & ~touches, u1, u2)
         through, steep = table.steep(met.fraction, met.cosine, touches)
@@ -241,7 +247,8 @@ def exact(
         alive = alive & (kept > 0.0) & (random.next_float32() < survive) & (bounce < _MAX_BOUNCES)
         return following, dr.select(alive, kept / survive, 0.0), bounce + 1, alive, random, *scores
 
-    begin = (trace.emit(sensor, number, trace.evenly(place, starts)), dr.full(mi.Float, 1.0, n_led * samples))
+    ray = trace.emit(sensor, number, recurrence.evenly(place, starts))
+    begin = (ray, dr.full(mi.Float, 1.0, n_led * samples))
     still = [dr.zeros(mi.Float, n_led * samples) for _ in per]
     dr.while_loop((*begin, mi.UInt32(0), mi.Bool(True), random, *still), going, step)
     scale = np.array([led.flux_W for led in sensor.leds])[:, None, None] / samples

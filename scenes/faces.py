@@ -1,7 +1,7 @@
 """Where rays meet the sensor's faces, and what polished faces do: the scene's laws without its dispatch.
 
 `mi.Scene.ray_intersect` fills in a full interaction and calls the shape and BSDF that were met, which takes
-longer than finding them. The sensor has seven kinds of faces, and all but the contact surface are flat, so
+longer than finding them. The sensor has eight kinds of faces, and all but the contact surface are flat, so
 that little is needed here: the meeting itself is Mitsuba's, position, normals and contact fraction on the
 mesh are interpolated as Mitsuba does it, and dielectrics follow Fresnel.
 
@@ -18,7 +18,7 @@ import numpy as np
 
 from .sensor import Sensor
 
-NOTHING, CONTACT, TO_GLASS, TO_AIR, WALL, RIM, LED, LAYER = range(8)
+NOTHING, CONTACT, TO_GLASS, TO_AIR, WALL, RIM, LED, LAYER, HOUSING = range(9)
 _KINDS = {"contact": CONTACT, "guide_to_glass": TO_GLASS, "glass_to_air": TO_AIR}
 _EPSILON = 1500.0 * 2.0**-24  # Mitsuba's for spawned rays, relative to the coordinates
 
@@ -143,7 +143,7 @@ def _in_fours(buffer: mi.Float, width: int, last: mi.Float | None = None) -> mi.
 def _kind(name: str) -> int:
     if name in _KINDS:
         return _KINDS[name]
-    return {"wall": WALL, "rim": RIM, "led": LED, "layer": LAYER}[name.split("_")[0]]
+    return {"wall": WALL, "rim": RIM, "led": LED, "layer": LAYER, "housing": HOUSING}[name.split("_")[0]]
 
 
 def _eta(name: str, sensor: Sensor) -> float:
@@ -159,11 +159,11 @@ def _eta(name: str, sensor: Sensor) -> float:
 
 
 def _normal(name: str) -> tuple[float, float, float]:
-    """As `build` sets them; LEDs and the contact surface have none here."""
+    """As `build` sets them, of a housing's sides inwards; LEDs and the contact surface have none here."""
     if _kind(name) in (TO_GLASS, TO_AIR, LAYER):
         return 0.0, 0.0, -1.0
     kind, _, side = name.partition("_")
-    if kind not in ("wall", "rim"):
+    if kind not in ("wall", "rim", "housing") or side == "floor":
         return 0.0, 0.0, 1.0
-    sign = 1.0 if side[0] == "+" else -1.0
+    sign = 1.0 if (side[0] == "+") != (kind == "housing") else -1.0
     return (sign, 0.0, 0.0) if side[1] == "x" else (0.0, sign, 0.0)

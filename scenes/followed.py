@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from . import trace, transport
+from . import recurrence, trace, transport
 from .answers import Answers
 from .bsdf import Table
 from .build import led_frame
@@ -178,7 +178,7 @@ def _lanes(
     n_led = len(sensor.leds)
     number = dr.arange(mi.UInt32, n_led * each) // mi.UInt32(dr.opaque(mi.UInt32, each))
     if not paired:
-        return number, trace.evenly(trace.side_by_side(each, n_led), start)
-    pairs = trace.side_by_side((each + 1) // 2, 1)
+        return number, recurrence.evenly(recurrence.side_by_side(each, n_led), start)
+    pairs = recurrence.side_by_side((each + 1) // 2, 1)
     within = dr.arange(mi.UInt32, n_led * each) - number * each
-    return number, trace.evenly(dr.gather(mi.UInt32, pairs, within >> 1), start)
+    return number, recurrence.evenly(dr.gather(mi.UInt32, pairs, within >> 1), start)

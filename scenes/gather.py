@@ -6,6 +6,7 @@ Import only after a variant is set (`scenes.backend.use`).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 
 import drjit as dr
@@ -13,8 +14,9 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from . import housing
 from .bsdf import Table
-from .build import led_frame, radiance
+from .build import floats, led_frame, radiance
 from .climb import STEP_MM, climb, descend
 from .irradiance import look_up
 from .lamp import Patterns
@@ -50,6 +52,8 @@ class Sight:
         Radiance at the camera over that in the guide, for each sight.
     lamps : (n_led, rows, columns)
         Radiance at the camera, W mm⁻² sr⁻¹, of LEDs in sight: embedded ones, straight or mirrored.
+    mirrors : list of housing.Mirror
+        How the pixels see a housing that reflects.
     """
 
     position_mm: NDArray[np.float32]
@@ -59,6 +63,7 @@ class Sight:
     width_mm: float
     windows: NDArray[np.float32]
     lamps: NDArray[np.float32]
+    mirrors: list[housing.Mirror]
 
 
 @dataclass(frozen=True)
@@ -71,6 +76,7 @@ class Glance:
     width_mm: float
     windows: list[mi.Float]
     lamps: list[mi.Float]
+    mirrors: list[housing.Mirror]
 
 
 def look(scene: mi.Scene, sensor: Sensor, table: Table, coupling: Coupling, rays: PixelRays) -> Sight:
@@ -78,35 +84,35 @@ def look(scene: mi.Scene, sensor: Sensor, table: Table, coupling: Coupling, rays
     shape, width = rays.transmittance.shape, sensor.guide.width_mm
     found = glance(scene, sensor, table, coupling, rays)
     dr.eval(found.points, found.windows, found.lamps, found.lean, found.off_normal)
+    dr.eval([(mirror.place, mirror.share) for mirror in found.mirrors])
     x, y = (np.asarray(found.points[0][i]).reshape(shape) for i in (0, 1))
     where = ((np.stack([x, y], axis=-1) - 0.5) * width).astype(np.float32)
     layers = np.stack(
         [np.broadcast_to(np.asarray(layer), rays.transmittance.size).reshape(shape) for layer in found.lamps]
     )
     through = np.stack([np.asarray(window).reshape(shape) for window in found.windows])
-    return Sight(where, found.points, found.lean, found.off_normal, width, through, layers)
+    seen = found.points, found.lean, found.off_normal, width, through, layers, found.mirrors
+    return Sight(where, *seen)
 
 
 def glance(scene: mi.Scene, sensor: Sensor, table: Table, coupling: Coupling, rays: PixelRays) -> Glance:
     """The same, not evaluated: Dr.Jit differentiates it to the scene's surface and to the table."""
     guide = sensor.guide
-    origin = [mi.Float(rays.origin_mm[..., i].astype(np.float32).ravel()) for i in range(3)]
-    direction = mi.Vector3f(*(mi.Float(rays.direction[..., i].astype(np.float32).ravel()) for i in range(3)))
-    gain = mi.Float((rays.transmittance * rays.radiance_scale).astype(np.float32).ravel())
-    mirrored = mi.Float(faces_reflectance(sensor, rays.direction[..., 2]).astype(np.float32).ravel())
+    origin, direction, gain, mirrored = _on_device(rays)
     contact = next(shape for shape in scene.shapes() if shape.id() == "contact")
 
     named = {shape.id(): mi.ShapePtr(shape) for shape in scene.shapes()}
     # the run in the glass and back, near the axis, as one in the guide
     in_glass = 2.0 * sensor.glass.thickness_mm * guide.refractive_index / sensor.glass.refractive_index
     in_glass += sum(2.0 * h * guide.refractive_index / n for h, n in guide.layers[1:])
-    deeper = _in_layers(sensor, rays.direction[..., 2])
+    deeper = _in_layers(sensor, rays)
     lamps, patterns = [mi.Float(0.0) for _ in sensor.leds], Patterns(sensor.leds)
     points: list[tuple[mi.Float, mi.Float, mi.Float]] = []
-    windows = []
+    windows: list[mi.Float] = []
+    mirrors: list[housing.Mirror] = []
     # sine of the angle in the tissue, by Snell's law
     bend = float(np.sqrt(coupling.scale))
-    start = mi.Point3f(*origin) + STEP_MM / direction.z * direction
+    start = origin + STEP_MM / direction.z * direction
     for _ in range(_SIGHTS):
         for rung in climb(scene, sensor, start, direction):
             _add_lamps(lamps, rung.met, gain * deeper[rung.layer - 1], sensor, named, patterns)
@@ -133,6 +139,8 @@ def glance(scene: mi.Scene, sensor: Sensor, table: Table, coupling: Coupling, ra
             _add_lamps(lamps, rung.met, alight, sensor, named, patterns)
             through &= rung.passes
         _add_lamps_below(lamps, si.p, down, dr.select(through, gain, 0.0), sensor, patterns)
+        if sensor.housing.reflects and not mirrors:
+            mirrors = _housing(sensor, origin, direction, si.p, dr.select(through, gain, 0.0), rays)
         gain = dr.select(through, gain * mirrored, 0.0)
         run = (si.p.z + guide.top_mm + in_glass) / direction.z
         start = mi.Point3f(si.p.x, si.p.y, -guide.top_mm) + mi.Vector3f(
@@ -140,21 +148,53 @@ def glance(scene: mi.Scene, sensor: Sensor, table: Table, coupling: Coupling, ra
         )
         start += STEP_MM / direction.z * direction
     off_normal = 1.0 - dr.sqrt(dr.maximum(1.0 - coupling.scale * dr.squared_norm(lean), 0.0))
-    return Glance(points, (bend * lean.x, bend * lean.y), off_normal, guide.width_mm, windows, lamps)
+    return Glance(points, (bend * lean.x, bend * lean.y), off_normal, guide.width_mm, windows, lamps, mirrors)
 
 
-def _in_layers(sensor: Sensor, cosine: NDArray[np.float64]) -> list[mi.Float]:
-    """Radiance at the camera per radiance in each lower layer, over that in the first one, at cosines there.
+def _housing(
+    sensor: Sensor,
+    origin: mi.Point3f,
+    direction: mi.Vector3f,
+    point: mi.Point3f,
+    gain: mi.Float,
+    rays: PixelRays,
+) -> list[housing.Mirror]:
+    """How pixels see the housing: straight by the faces below, and from a point of the contact that mirrors
+    this share of radiance in the guide. Slopes there are left out, and so are ways with two mirrors."""
+    n, (_, _, clear, mirrored) = sensor.guide.refractive_index, _on_device(rays)
+    sine_x, sine_y = n * direction.x, n * direction.y  # in air
+    in_air = dr.rsqrt(dr.maximum(1.0 - dr.square(sine_x) - dr.square(sine_y), 1e-6))
+    lean_x, lean_y = sine_x * in_air, sine_y * in_air
+    run, away = (point.z + sensor.guide.top_mm) / direction.z, sensor.camera.distance_mm
+    # below the first layer it is the way up again
+    x = point.x + run * direction.x + origin.x - away * lean_x
+    y = point.y + run * direction.y + origin.y - away * lean_y
+    by_contact = gain * (1.0 - mirrored) * n**2
+    return housing.mirrors(
+        sensor, (lean_x, lean_y), (x, y), dr.select(clear > 0.0, mirrored, 0.0), by_contact
+    )
+
+
+@lru_cache(maxsize=4)
+def _on_device(rays: PixelRays) -> tuple[mi.Point3f, mi.Vector3f, mi.Float, mi.Float]:
+    """Origin, direction, radiance at the camera over that in the guide, and `mirrored`, pixel after pixel."""
+    points = np.moveaxis(np.concatenate([rays.origin_mm, rays.direction], axis=-1), -1, 0)
+    gain = rays.transmittance * rays.radiance_scale
+    x, y, z, *direction, gain, mirrored = (floats(values) for values in (*points, gain, rays.mirrored))
+    return mi.Point3f(x, y, z), mi.Vector3f(*direction), gain, mirrored
+
+
+def _in_layers(sensor: Sensor, rays: PixelRays) -> list[mi.Float]:
+    """Radiance at the camera per radiance in each lower layer, over that in the first one, of pixels' rays.
 
     (On the way to a mirror image the share that faces between layers send back, 1e-3, counts as passed.)
     """
     first = sensor.guide.refractive_index
-    through = 1.0 - faces_reflectance(sensor, cosine)
-    found = []
+    through, cosine, found = 1.0 - rays.mirrored, rays.direction[..., 2], []
     for k, layer in enumerate(sensor.guide.lower, start=1):
         ratio = (1.0 - faces_reflectance(sensor, cosine, k)) / np.maximum(through, 1e-9)
         ratio *= (first / layer.refractive_index) ** 2
-        found.append(mi.Float(ratio.astype(np.float32).ravel()))
+        found.append(floats(ratio))
     return found
 
 

@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from . import build, direct, gather, surface, transport
+from . import build, direct, gather, housing, surface, transport
 from .answers import Answers
 from .contact import ContactOptics
 from .followed import Emission, Stage, follow
@@ -126,6 +126,7 @@ def gradients(
     names = tuple(one if isinstance(one, str) else one.name for one in parameters)
     if sensor.inclusion is not None:
         raise NotModelled(COLOUR)
+    housing.refuse(sensor, "derivatives of the picture")
     for one in parameters:
         _check(sensor, one)
     renderer.check_leds(pressed)

@@ -181,7 +181,7 @@ class Entrance:
         return Entrance(basis, rows[0], tuple(rows[1:]))
 
 
-def transmitted(entrance: Entrance, irradiance: NDArray[np.floating], only: int | None = None) -> Array:
+def transmitted(entrance: Entrance, irradiance: NDArray[np.floating], only: int | None = None) -> Singles:
     """Irradiance that enters the tissue, weighed with each function of the angle of entry, W/mm².
 
     From maps (n, layers, m, m) on cells over the face; (n, functions, m, m): those of harmonic 0, and of each
@@ -204,7 +204,7 @@ def transmitted(entrance: Entrance, irradiance: NDArray[np.floating], only: int 
         for _ in ("cosine", "sine"):
             summed(rows, first)
             first += rows.shape[1]
-    return np.stack(found, axis=1).astype(np.float64)
+    return np.stack(found, axis=1)
 
 
 def by_fraction(rows: Array, fraction: Array) -> Singles:

@@ -108,7 +108,7 @@ class Passage:
     transport_per_mm: float
     cell_mm: float
 
-    def enter(self, maps: Array, *, glimpse: bool = True) -> tuple[Array, Glimpse]:
+    def enter(self, maps: NDArray[np.floating], *, glimpse: bool = True) -> tuple[Array, Glimpse]:
         """From maps (n, functions, m, m) of what enters, W/mm²: Lambertian irradiance that would come out as
         it does, (n, cells, cells) with the margin; and what of the first pass leaves along the normal, or
         nothing where no `glimpse` is asked for."""
@@ -151,7 +151,7 @@ class Passage:
         """
         rings, light = slice(self.rings), upward.astype(np.float32)
         turning = self.turns > 0 and not even
-        halves = [self.rings + half * self.turns + np.arange(self.turns) for half in (0, 1) if turning]
+        halves = [self.rings + half * self.turns + np.arange(self.turns) for half in (0, 1)]
         entering, glimpse = self._nothing(len(light))
         for number, fields in enumerate(light):
             thrown = _weighed(face.even[:, : len(fields)], fields)
@@ -161,11 +161,12 @@ class Passage:
                 _summed(spectra, self.entering[rings]) - spectra[0],
                 _summed(spectra, self.seen[rings]),
             )
-            for half in halves:
-                aslant = self._back(self._forth(fields[0]) * self.entering[half])
-                spectra = self._forth(_weighed(face.turning, aslant))
-                found += _summed(spectra, self.entering[half])
-                seen += _summed(spectra, self.seen[half])
+            if turning:
+                aslant = self._back(self._forth(fields[0]) * self.entering[np.concatenate(halves)])
+                for half, own in zip(halves, np.split(aslant, len(halves)), strict=True):
+                    spectra = self._forth(_weighed(face.turning, own))
+                    found += _summed(spectra, self.entering[half])
+                    seen += _summed(spectra, self.seen[half])
             entering[number], glimpse.spectra[number] = self._back(found), seen
         return entering, glimpse
 

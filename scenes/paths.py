@@ -15,10 +15,10 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from . import trace
+from . import recurrence, trace
 from .bsdf import Table
 from .climb import climb
-from .faces import CONTACT, LED, NOTHING, WALL, Faces
+from .faces import CONTACT, HOUSING, LED, NOTHING, WALL, Faces
 from .sensor import Sensor
 from .view import PixelRays
 
@@ -70,7 +70,7 @@ def from_leds(
     starts = np.random.Generator(np.random.Philox(seed)).integers(0, 2**32, size=4)
     place = mi.UInt32(np.tile(np.arange(each, dtype=np.uint32), n_led))
     number = mi.UInt32(led)
-    ray = trace.emit(sensor, number, trace.evenly(place, starts))
+    ray = trace.emit(sensor, number, recurrence.evenly(place, starts))
     return record(scene, sensor, table, number, ray, seed, bounces)
 
 
@@ -201,6 +201,7 @@ def _step(  # type: ignore[no-untyped-def]
     stops = elsewhere & (random.next_float32() >= kept)
     end(stops & (here.kind == LED), "leds")
     end(stops & (here.kind == WALL), "walls")
+    end(stops & (here.kind == HOUSING), "housing")
     end(stops, "frame")
 
     face = mi.UInt32(0)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from threadpoolctl import threadpool_limits
 
-from . import build, gather, stokes, trace, view
+from . import build, gather, housing, recurrence, stokes, trace, view
 from .bsdf import Table
 from .gather import Sight
 from .irradiance import angular_basis
@@ -65,6 +65,7 @@ class Polarised:
 
     def __init__(self, sensor: Sensor, pressed: OpticalSurface) -> None:
         """Load the scene and press its surface."""
+        housing.refuse(sensor, "polarised light")
         self.sensor = sensor
         with threadpool_limits(1):
             optics = build.optics_of(sensor)
@@ -145,7 +146,7 @@ class Polarised:
     def _points(self, each: int, starts: np.ndarray) -> tuple[mi.UInt32, list[mi.Float]]:
         n_led = len(self.sensor.leds)
         number = dr.arange(mi.UInt32, n_led * each) // mi.UInt32(dr.opaque(mi.UInt32, each))
-        return number, trace.evenly(trace.side_by_side(each, n_led), starts)
+        return number, recurrence.evenly(recurrence.side_by_side(each, n_led), starts)
 
     def _from_leds(self, each: int, starts: np.ndarray) -> tuple[mi.UInt32, Start]:
         number, u = self._points(each, starts)

@@ -56,6 +56,8 @@ class Rendering:
         scatters by 12 %; `tests/test_noise.py`).
     seconds : float
         Wall-clock time.
+    from_housing_percent : float
+        Of all this radiance, what is the inside of a housing that reflects, mirrored in glass and contact.
     sinks, trapped : (n_led, len(trace.SINKS)) and (n_led,), or None
         W that end in each sink, and W trapped at their first contact with the surface (see
         `transport.Light`); None for the reference quality.
@@ -68,6 +70,7 @@ class Rendering:
     surface: surface.OpticalSurface
     noise_percent: float
     seconds: float
+    from_housing_percent: float = 0.0
     sinks: Array | None = None
     trapped: Array | None = None
     traced: tuple[Array, ...] | None = None
@@ -165,7 +168,10 @@ class Renderer:
             raise ValueError(f"noise: received {noise:g} %; allowed: more than 0")
         if self.sensor.inclusion is not None and (quality != "reference" or traced is not None):
             raise NotModelled(COLOUR)
-        from . import build, gather
+        from . import build, gather, housing
+
+        if traced is not None:
+            housing.refuse(self.sensor, "light that was learned, or is that of another press")
 
         start = time.perf_counter()
         shape = pressed
@@ -188,6 +194,7 @@ class Renderer:
             shape,
             found.noise_percent,
             time.perf_counter() - start,
+            found.from_housing_percent,
             found.sinks,
             found.trapped,
             None if found.traced is None else (found.traced,),
@@ -213,28 +220,30 @@ class Renderer:
         known: Array | TracedLight | None,
     ) -> _Found:
         """Gathered light, and traced light from independent passes, or as it is `known`."""
-        from . import direct, gather, transport
+        from . import direct, gather, trace, transport
 
-        straight = direct.direct(self.sensor, self.basis, shape).astype(np.float32)
+        straight = direct.direct(self.sensor, self.basis, shape)
         ground = transport.survey(self.scene, self.sensor)
-        sums: list[Any] = []
+        fallen, sums = np.zeros(0), list[Any]()
         with threadpool_limits(1):
             under = transport.Under.at(self.basis, self.behind, ground)
-            lit = under.upward(straight) if known is None else None
+            lit = under.coarser.upward(transport.coarser(straight)) if known is None else None
         parts = (self.scene, self.sensor, self.table, under, straight, samples)
 
         def glances() -> Iterator[NDArray[np.floating]]:
             for number in range(MOST_PASSES):
                 with threadpool_limits(1):
                     light = transport.transport(*parts, seed * MOST_PASSES + number, lit)
-                    seen = under.glanced(light.upward)
-                found = (light.traced, light.sinks, light.trapped)
+                    seen = under.coarser.glanced(light.upward)
+                found = (light.landed, light.sinks, light.trapped, light.fallen)
                 sums[:] = found if number == 0 else [a + b for a, b in zip(sums, found, strict=True)]
-                yield gather.picture(sight, seen, transport.MARGIN, lamps=False)[0]
+                yield gather.picture(sight, seen, under.coarser.margin, lamps=False)[0]
 
         if known is None:
             count, noise = effort.spend(glances())
-            traced, sinks, trapped = (total / count for total in sums)
+            landed, sinks, trapped, fallen = (total / count for total in sums)
+            with threadpool_limits(1):
+                traced = transport.even(landed, transport.GRID // trace.CELLS)
         elif isinstance(known, np.ndarray):
             noise, traced, sinks, trapped = 0.0, known, None, None
         else:
@@ -243,7 +252,17 @@ class Renderer:
         with threadpool_limits(1):
             seen = under.seen(straight + traced.astype(np.float32))
         effort.tell(1.0)
-        return _Found(gather.picture(sight, seen, transport.MARGIN), noise, sinks, trapped, traced)
+        picture = gather.picture(sight, seen, transport.MARGIN)
+        share = self._add_housing(picture, sight, fallen) if self.sensor.housing.reflects else 0.0
+        return _Found(picture, noise, share, sinks, trapped, traced)
+
+    def _add_housing(self, picture: NDArray[np.floating], sight: Sight, fallen: Array) -> float:
+        """Add what is seen of the housing to the picture (n_led, rows, columns); its share, per cent."""
+        from . import housing
+
+        glow = 1e6 * housing.seen(self.sensor, sight.mirrors, fallen).reshape(picture.shape)
+        picture += glow
+        return float(100.0 * glow.sum() / max(picture.sum(), 1e-30))
 
     def _followed(
         self,
@@ -254,8 +273,10 @@ class Renderer:
         place: tuple[Array, Array] | None,
     ) -> _Found:
         """Every ray followed, in independent passes."""
-        from . import exact, transport
+        from . import exact, housing, transport
 
+        tally = housing.Tally(self.sensor) if self.sensor.housing.reflects else None
+        flux = np.array([led.flux_W for led in self.sensor.leds])
         fraction = transport.survey(self.scene, self.sensor).fraction
         parts = (self.scene, self.sensor, self.table, self.rays, fraction, samples)
         total: Array | float = 0.0
@@ -263,13 +284,17 @@ class Renderer:
         def passes() -> Iterator[Array]:
             nonlocal total
             for number in range(MOST_PASSES):
-                seen = exact.exact(*parts, seed * MOST_PASSES + number, place=place)
+                seen = exact.exact(*parts, seed * MOST_PASSES + number, place=place, tally=tally)
                 layers = 1e6 * (np.einsum("snyx,syx->nyx", seen, sight.windows) + sight.lamps)
                 total = total + layers
                 yield layers.sum(axis=0)
 
         count, noise = effort.spend(passes())
-        return _Found(np.asarray(total) / count, noise)
+        picture, share = np.asarray(total) / count, 0.0
+        if tally is not None:
+            fallen = tally.collected() * (flux / samples / count)[:, None, None, None]
+            share = self._add_housing(picture, sight, fallen)
+        return _Found(picture, noise, share)
 
 
 def passes(samples: int, n_led: int) -> tuple[int, int]:
@@ -284,6 +309,7 @@ class _Found:
 
     radiance: NDArray[np.floating]
     noise_percent: float
+    from_housing_percent: float = 0.0
     sinks: Array | None = None
     trapped: Array | None = None
     traced: Array | None = None

@@ -193,7 +193,7 @@ class Response:
         entrance, meets = self.under.entrance, self.under.ground.meets
         light = landed.light[number : number + 1]
         lights = np.concatenate([light[:, : entrance.basis.layers], landed.slopes[:, number]])
-        found = transmitted(entrance, lights * meets, only)
+        found = transmitted(entrance, lights * meets, only).astype(np.float64)
         for one, change in zip(found[1:], self.changes, strict=True):
             for steep, layers in change.entrances:
                 one += transmitted(steep, light[:, layers] * meets, only)[0]

@@ -27,6 +27,7 @@ __all__ = [
     "Conflict",
     "Glass",
     "Guide",
+    "Housing",
     "Led",
     "Lower",
     "NotModelled",
@@ -163,6 +164,21 @@ class Glass:
 
 
 @dataclass(frozen=True, config=CONFIG)
+class Housing:
+    """The box below the glass, as wide as the guide, with the camera's pinhole in its floor."""
+
+    reflectance: Annotated[
+        float,
+        Field(ge=0.0, le=0.98, description="Share of light that its inside sends back, evenly; 0: black."),
+    ] = 0.0
+
+    @property
+    def reflects(self) -> bool:
+        """Whether any light comes back from it."""
+        return self.reflectance > 0.0
+
+
+@dataclass(frozen=True, config=CONFIG)
 class Sensor:
     """All that the optics need to know, checked as a whole."""
 
@@ -184,6 +200,10 @@ class Sensor:
     inclusion: Annotated[
         Colour | None, Field(description="An inclusion's own optics; only the reference quality sees it.")
     ] = None
+    # not in the repr: what is hashed of sensors in black stays what it was
+    housing: Annotated[Housing, Field(description="The box below the glass.")] = field(
+        default=Housing(), repr=False
+    )
 
     def __post_init__(self) -> None:
         found = list(conflicts(self.guide, self.leds, self.camera, self.skin, self.glass))

@@ -97,7 +97,7 @@ class SpectralRenderer:
         radiance = np.zeros((len(self.sensor.leds), *camera.shape, *planes))
         sinks: NDArray[np.float64] | None = None
         trapped = np.zeros(len(self.sensor.leds))
-        variance, first = 0.0, None
+        variance, veil, first = 0.0, 0.0, None
         walked: list[NDArray[np.float64]] = []
         for number, (band, leds, renderer) in enumerate(
             zip(self.bands, self._leds, self.renderers, strict=True)
@@ -131,6 +131,7 @@ class SpectralRenderer:
                     sinks = np.zeros((len(self.sensor.leds), one.sinks.shape[1]))
                 sinks[list(leds)] += band.energy * one.sinks
                 trapped[list(leds)] += band.energy * one.trapped
+            veil += one.from_housing_percent * float(np.mean(counts))
             first = first or one
             walked += one.traced or ()
         assert first is not None
@@ -139,6 +140,7 @@ class SpectralRenderer:
             first,
             radiance=radiance.astype(np.float32),
             noise_percent=float(noise),
+            from_housing_percent=veil / max(_mean(radiance), 1e-30),
             sinks=sinks,
             trapped=None if sinks is None else trapped,
             traced=tuple(walked) or None,

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from . import build, direct, gather, transport
+from . import build, direct, gather, housing, transport
 from .render import PATHS_PER_LED, Renderer
 from .surface import OpticalSurface
 
@@ -52,7 +52,8 @@ class Straight:
 
 
 def gathered(renderer: Renderer, shape: OpticalSurface) -> Straight:
-    """Gather light on a press and near it."""
+    """Gather light on a press and near it. Raises `NotModelled` where the housing reflects."""
+    housing.refuse(renderer.sensor, "pictures beside the picture of one press")
     sensor, basis = renderer.sensor, renderer.basis
     relief = direct.relief(sensor, shape)
     slopes = []
@@ -63,7 +64,7 @@ def gathered(renderer: Renderer, shape: OpticalSurface) -> Straight:
             moved[number] += sign * step
             ends.append(direct.on(sensor, basis, moved, _POINTS))
         slopes.append(((ends[0] - ends[1]) / (2.0 * step)).astype(np.float32))
-    return Straight(relief, direct.on(sensor, basis, relief), np.stack(slopes))
+    return Straight(relief, direct.on(sensor, basis, relief).astype(np.float64), np.stack(slopes))
 
 
 def traced(

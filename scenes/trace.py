@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import drjit as dr
 import mitsuba as mi
@@ -20,7 +19,8 @@ from numpy.typing import NDArray
 from .answers import Answers
 from .bsdf import Table
 from .build import led_frame
-from .faces import CONTACT, LAYER, LED, NOTHING, TO_AIR, TO_GLASS, WALL, Faces, Meeting
+from .faces import CONTACT, HOUSING, LAYER, LED, NOTHING, TO_AIR, TO_GLASS, WALL, Faces, Meeting
+from .housing import Tally
 from .irradiance import Layered, look_up
 from .lamp import Patterns
 from .sensor import Sensor
@@ -29,9 +29,10 @@ from .tissue import Coupling
 Array = NDArray[np.float64]
 
 CELLS = 100  # of the irradiance grid, per side
-SINKS = ("tissue", "guide", "glass", "walls", "frame", "leds", "below", "aside")
+SINKS = ("tissue", "guide", "glass", "walls", "frame", "leds", "below", "aside", "housing")
 """Where light ends: enters the tissue; absorbed in guide, glass, by painted walls, the glass's black frame,
-LEDs' bodies; leaves downwards; leaves through the sides, or never went in."""
+LEDs' bodies; leaves downwards, for a black housing; leaves through the sides, or never went in; absorbed by a
+housing that reflects."""
 
 # Deposits are summed as integers: the sum does not depend on the order of threads
 _FIXED_POINT = float(2**20)
@@ -39,9 +40,6 @@ _MAX_BOUNCES = 512
 # Legs of the two families of paths that `direct` gathers, and any other
 IN_AIR, IN_GUIDE, _DOWN, _IN_GLASS_UP, _BACK_UP, OTHER = range(6)
 _SURE_BOUNCES = 12  # before Russian roulette
-# Fractional parts of powers of 1/phi_4, phi_4 the root of x^5 = x + 1, times 2^32: an additive recurrence
-# that fills the unit 4-cube evenly (Roberts 2018; key roberts2018)
-_RECURRENCE = tuple(int((1.1673039782614187 ** -(k + 1) % 1.0) * 2**32) | 1 for k in range(4))
 
 
 @dataclass(frozen=True)
@@ -81,6 +79,7 @@ def walk(
     answers: Answers | None = None,
     scores: Sequence[mi.Float] = (),
     paired: bool = False,
+    tally: Tally | None = None,
 ) -> Landed:
     """Follow light through the scene until it has ended.
 
@@ -99,6 +98,8 @@ def walk(
         to begin with.
     paired
         Rays 2k and 2k + 1 make the same random choices.
+    tally
+        Counts the light that falls on the housing.
     """
     n_led, layers, width = len(sensor.leds), basis.layers, sensor.guide.width_mm
     weights = basis.weights()
@@ -152,7 +153,9 @@ def walk(
             scores = [score + more for score, more in zip(scores, turned, strict=True)]
         entering = dr.select(on_contact, throughput * through, 0.0)
         sink["tissue"] += entering
-        elsewhere = alive & ~on_contact
+        elsewhere, on_housing = alive & ~on_contact, met.kind == HOUSING
+        if tally is not None:
+            tally.add(number, met.p, throughput, elsewhere & on_housing)
         sample1, sample2 = random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32())
         direction, share = bounce_off(sensor, faces, met, elsewhere, sample1, sample2)
         direction = dr.select(on_contact, met.mirrored, direction)
@@ -161,7 +164,8 @@ def walk(
         on_led, on_wall = met.kind == LED, met.kind == WALL
         sink["leds"] += dr.select(on_led, stopped, 0.0)
         sink["walls"] += dr.select(on_wall, stopped, 0.0)
-        sink["frame"] += dr.select(on_led | on_wall, 0.0, stopped)
+        sink["housing"] += dr.select(on_housing, stopped, 0.0)
+        sink["frame"] += dr.select(on_led | on_wall | on_housing, 0.0, stopped)
         passed = elsewhere & (cosine * dr.dot(direction, met.normal) < 0.0)
         leg = _next_leg(leg, met.kind, passed)
 
@@ -305,34 +309,6 @@ def depart(scene: mi.Scene, sensor: Sensor, table: Table, u: list[mi.Float]) -> 
     return Departure(meets, fraction, cosine, si.sh_frame.n, si.spawn_ray(si.to_world(direction)), si.p)
 
 
-def side_by_side(each: int, n_led: int) -> mi.UInt32:
-    """Indices 0 to `each`, for each LED, such that points of `evenly` that lie together follow each other.
-
-    Lanes that run together then meet the same faces and end together: a third less time for the same paths.
-    """
-    return mi.UInt32(np.tile(_morton(each), n_led))
-
-
-@lru_cache(maxsize=16)
-def _morton(each: int, bits: int = 5) -> NDArray[np.uint32]:
-    """Order of the first points along Morton's curve (1966; key morton1966) through the unit 4-cube."""
-    step = np.array(_RECURRENCE, dtype=np.uint64)[:, None]
-    cell = (np.arange(each, dtype=np.uint64) * step & np.uint64(2**32 - 1)) >> np.uint64(32 - bits)
-    key = np.zeros(each, dtype=np.uint64)
-    for bit in range(bits - 1, -1, -1):
-        for axis in cell[::-1]:
-            key = key << np.uint64(1) | axis >> np.uint64(bit) & np.uint64(1)
-    return np.argsort(key, kind="stable").astype(np.uint32)
-
-
-def evenly(index: mi.UInt32, starts: np.ndarray) -> list[mi.Float]:
-    """Points of the unit 4-cube that fill it evenly, by an additive recurrence from a random start."""
-    return [
-        _fraction(dr.opaque(mi.UInt32, int(start)) + index * step)
-        for start, step in zip(starts, _RECURRENCE, strict=True)
-    ]
-
-
 def absorb(sensor: Sensor, ray: mi.Ray3f, met: Meeting, throughput: mi.Float) -> dict[str, mi.Float]:
     """What guide and glass take on the way to the next face; its middle tells through which it leads."""
     guide, glass = sensor.guide, sensor.glass
@@ -366,6 +342,11 @@ def bounce_off(
         back = mi.Frame3f(met.normal).to_world(mi.Vector3f(back.x, back.y, -back.z))
         share = dr.select(coated, dr.select(met.cosine < 0.0, albedo, 0.0), share)
         direction = dr.select(coated, back, direction)
+    if sensor.housing.reflects:
+        inside = active & (met.kind == HOUSING)
+        back = mi.Frame3f(met.normal).to_world(mi.warp.square_to_cosine_hemisphere(sample2))
+        share = dr.select(inside, sensor.housing.reflectance, share)
+        direction = dr.select(inside, back, direction)
     return direction, share
 
 
@@ -393,8 +374,3 @@ def _next_leg(leg: mi.UInt32, kind: mi.UInt32, passed: mi.Bool) -> mi.UInt32:
     ):
         following = dr.select((leg == before) & event, mi.UInt32(after), following)
     return following
-
-
-def _fraction(integer: mi.UInt32) -> mi.Float:
-    """Upper 24 bits of an integer as a number in [0, 1)."""
-    return mi.Float(integer >> 8) * float(2**-24)

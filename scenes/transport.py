@@ -6,13 +6,15 @@ Import only after a variant is set (`scenes.backend.use`).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from . import trace
+from . import housing, recurrence, trace
 from .abreast import abreast
 from .bsdf import Table
 from .gather import meet
@@ -29,24 +31,35 @@ GRID = 200  # cells of the maps per side
 MARGIN = 30  # cells beside them, in which light comes out of bare skin
 INSIDE = slice(MARGIN, MARGIN + GRID)
 ORDERS = 12  # of re-emission at most
+_LEAST_SHARE = 1e-6
 ENOUGH = 3e-3  # share of the light below which the orders to come are estimated
 
 
 @dataclass(frozen=True)
 class Behind:
-    """What lies behind the contact, and how light spreads in it."""
+    """What lies behind the contact, and how light spreads in it.
+
+    Attributes
+    ----------
+    coarse
+        The same on the cells that walks are counted on; there it is None.
+    """
 
     coupling: Coupling
     passage: Passage
     spread: Spread
+    coarse: Behind | None
 
     @staticmethod
-    def of(sensor: Sensor, coupling: Coupling) -> Behind:
+    def of(sensor: Sensor, coupling: Coupling, cells: int = GRID) -> Behind:
         """Behind this sensor's contact."""
         _, body = body_behind(sensor.skin, sensor.tissue)
-        width, wide = sensor.guide.width_mm, GRID + 2 * MARGIN
-        first = passage(coupling, width, GRID, MARGIN)
-        return Behind(coupling, first, spreader(body, coupling, width * wide / GRID, wide))
+        width, margin = sensor.guide.width_mm, MARGIN * cells // GRID
+        wide = cells + 2 * margin
+        first = passage(coupling, width, cells, margin)
+        spread = spreader(body, coupling, width * wide / cells, wide)
+        coarse = Behind.of(sensor, coupling, trace.CELLS) if cells > trace.CELLS else None
+        return Behind(coupling, first, spread, coarse)
 
 
 @dataclass(frozen=True)
@@ -55,14 +68,19 @@ class Ground:
 
     Attributes
     ----------
-    fraction : (GRID, GRID)
+    fraction : (m, m)
         Real contact fraction of the deformed surface there; 0 beside the surface.
-    meets : (GRID, GRID)
-        Whether the surface lies there.
+    meets : (m, m), single precision
+        Share of the cell in which the surface lies.
     """
 
     fraction: Array
-    meets: NDArray[np.bool_]
+    meets: Singles
+
+    def coarser(self) -> Ground:
+        """On the cells that walks are counted on."""
+        meets = coarser(self.meets)
+        return Ground(coarser(self.fraction * self.meets) / np.maximum(meets, _LEAST_SHARE), meets)
 
 
 @dataclass(frozen=True)
@@ -71,26 +89,34 @@ class Light:
 
     Attributes
     ----------
-    upward : (n_led, modes, GRID, GRID)
+    upward : (n_led, modes, trace.CELLS, trace.CELLS)
         Light that goes up inside the tissue towards the contact surface, V_i of `tissue`, W/mm².
     sinks : (n_led, len(trace.SINKS))
         W that end there; "tissue" is what the tissue keeps.
     trapped : (n_led,)
         W that come to the contact surface for the first time beyond the critical angle.
-    traced : (n_led, layers, GRID, GRID), single precision
-        Weighted irradiance of all light that was not gathered, W/mm², all orders together.
+    landed : (n_led, layers, trace.CELLS, trace.CELLS), single precision
+        Weighted irradiance of all light that was not gathered, W/mm², all orders together, as it was counted.
+    fallen : (n_led, 5, housing.CELLS, housing.CELLS), or (n_led, 0) of a black one
+        W that fell on the sides of the housing (`housing.Tally`).
     """
 
     upward: Array
     sinks: Array
     trapped: Array
-    traced: Singles
+    landed: Singles
+    fallen: Array
+
+    @property
+    def traced(self) -> Singles:
+        """`landed`, smooth: (n_led, layers, GRID, GRID)."""
+        return even(self.landed, GRID // trace.CELLS)
 
 
 def survey(scene: mi.Scene, sensor: Sensor) -> Ground:
     """Look at the deformed surface from below, cell by cell."""
     found = [np.asarray(values).reshape(GRID, GRID) for values in glance(scene, sensor)]
-    return Ground(found[0].astype(np.float64), found[1].astype(bool))
+    return Ground(found[0].astype(np.float64), found[1].astype(np.float32))
 
 
 def glance(scene: mi.Scene, sensor: Sensor) -> tuple[mi.Float, mi.Bool]:
@@ -119,7 +145,7 @@ def transport(
     """Follow the LEDs' light until it has ended.
 
     Mirrored light walks through the guide (`trace.walk`); what enters the tissue spreads there, and what
-    comes back out walks again, order by order.
+    comes back out walks again, order by order, from the cells that walks are counted on.
 
     Parameters
     ----------
@@ -130,17 +156,18 @@ def transport(
     seed
         Seed of every random choice; the result depends on nothing else, not even on the number of threads.
     lit
-        `Under.upward` of the gathered light, if it is known.
+        `Under.upward` of the gathered light on those cells (`Under.coarser`), if it is known.
     """
     n_led = len(sensor.leds)
+    under = under.coarser
     basis, behind = under.entrance.basis, under.behind
     flux = np.array([led.flux_W for led in sensor.leds])
     starts = np.random.Generator(np.random.Philox(seed)).integers(0, 2**32, size=(ORDERS + 1, 4))
 
-    def walk(order: int, each: int, upward: Array | None) -> tuple[Singles, Array, Array, Array]:
+    def walk(order: int, each: int, upward: Array | None) -> tuple[Singles, Array, Array, Array, Array]:
         index = dr.arange(mi.UInt32, n_led * each)
         number = index // mi.UInt32(dr.opaque(mi.UInt32, each))
-        u = trace.evenly(trace.side_by_side(each, n_led), starts[order])
+        u = recurrence.evenly(recurrence.side_by_side(each, n_led), starts[order])
         if upward is None:
             legs = [first_leg(led) for led in sensor.leds]
             leg = dr.gather(mi.UInt32, mi.UInt32(np.array(legs, dtype=np.uint32)), number)
@@ -151,33 +178,51 @@ def transport(
             amount /= dr.gather(mi.Float, mi.Float(np.maximum(scale, 1e-30)), number)
             leg = mi.UInt32(trace.OTHER)
         begun = np.asarray(amount, dtype=np.float64).reshape(n_led, each).mean(axis=1)
-        found = trace.walk(scene, sensor, table, basis, number, ray, amount, leg, 16 * seed + order)
+        tally = housing.Tally(sensor) if sensor.housing.reflects else None
+        parts = (scene, sensor, table, basis, number, ray, amount, leg, 16 * seed + order)
+        found = trace.walk(*parts, tally=tally)
         area = (sensor.guide.width_mm / trace.CELLS) ** 2
         maps = (found.maps * (scale / each / area)[:, None, None, None]).astype(np.float32)
         sinks, trapped = found.sinks * (scale / each)[:, None], found.trapped * scale / each
-        return maps, sinks, trapped, begun * scale
+        fallen = np.zeros((n_led, 0))
+        if tally is not None:
+            fallen = tally.collected() * (scale / each)[:, None, None, None]
+        return maps, sinks, trapped, fallen, begun * scale
 
+    plain = len(basis.columns)  # the maps that `Under.again` reads
     each = max(samples // 2, 1)
-    maps, sinks, trapped, _ = walk(0, each, None)
-    traced = smooth(maps, GRID // trace.CELLS)
-    landed = traced
-    total = newest = under.again(traced) + (under.upward(straight) if lit is None else lit)
+    maps, sinks, trapped, fell, _ = walk(0, each, None)
+    landed, fallen = maps, fell
+    newest = under.again(even(maps[:, :plain])) + (under.upward(coarser(straight)) if lit is None else lit)
+    total = newest
     ratio = np.ones(n_led)
     for order in range(1, ORDERS + 1):
         before = newest[:, 0].sum(axis=(1, 2))
         if (before * ratio).sum() <= ENOUGH * total[:, 0].sum():
             break
-        maps, more, _, begun = walk(order, max(each >> min(2 * order, 6), 2), newest)
+        maps, more, _, fell, begun = walk(order, max(each >> min(2 * order, 6), 2), newest)
         sinks = sinks + more
         sinks[:, 0] -= begun
-        landed = smooth(maps, GRID // trace.CELLS)
-        newest = under.again(landed)
-        total, traced = total + newest, traced + landed
+        newest = under.again(even(maps[:, :plain]))
+        total, landed, fallen = total + newest, landed + maps, fallen + fell
         ratio = newest[:, 0].sum(axis=(1, 2)) / np.maximum(before, 1e-300)
     # each order is like the one before by now: the rest is a geometric series
     ratio = np.clip(ratio, 0.0, 0.9)
     rest = (ratio / (1.0 - ratio))[:, None, None, None]
-    return Light(total + newest * rest, sinks, trapped, traced + landed * rest.astype(np.float32))
+    fallen = fallen + fell * rest.reshape(n_led, *(fell.ndim - 1) * (1,))
+    return Light(total + newest * rest, sinks, trapped, landed + maps * rest.astype(np.float32), fallen)
+
+
+def even(maps: Singles, factor: int = 1) -> NDArray[Any]:
+    """Counted light (n_led, layers, m, m), smooth on cells so many times finer."""
+    return np.stack(abreast(lambda number: smooth(maps[number], factor), len(maps)))
+
+
+def coarser(maps: NDArray[Any]) -> NDArray[Any]:
+    """Means over squares of the last two axes that are cells of walks."""
+    side = maps.shape[-1] // trace.CELLS
+    cells = maps.reshape(*maps.shape[:-2], trace.CELLS, side, trace.CELLS, side)
+    return cells.mean(axis=(-3, -1), dtype=maps.dtype)
 
 
 def first_leg(led: Led) -> int:
@@ -191,7 +236,7 @@ def first_leg(led: Led) -> int:
 class Under:
     """The tissue under one contact.
 
-    What has `landed` is weighted irradiance (n_led, layers, GRID, GRID), W/mm².
+    What has `landed` is weighted irradiance (n_led, layers, m, m), W/mm².
     """
 
     entrance: Entrance
@@ -202,12 +247,18 @@ class Under:
 
     @staticmethod
     def at(basis: AngularBasis, behind: Behind, ground: Ground) -> Under:
-        fraction = np.pad(ground.fraction, MARGIN, constant_values=np.nan)
+        fraction = np.pad(ground.fraction, behind.passage.margin, constant_values=np.nan)
         entrance, face = Entrance.at(basis, ground.fraction), behind.passage.face(fraction)
         return Under(entrance, behind, ground, behind.spread.on(fraction), face)
 
+    @cached_property
+    def coarser(self) -> Under:
+        """On the cells that walks are counted on."""
+        assert self.behind.coarse is not None
+        return Under.at(self.entrance.basis, self.behind.coarse, self.ground.coarser())
+
     def again(self, landed: NDArray[np.floating]) -> Array:
-        """Light that goes up in the tissue, (n_led, modes, GRID, GRID), as if it had entered evenly from all
+        """Light that goes up in the tissue, (n_led, modes, m, m), as if it had entered evenly from all
         sides: enough for light that has been in the tissue before."""
 
         def one(number: int) -> Array:
@@ -251,18 +302,25 @@ class Under:
     def glanced(self, upward: Array) -> Seen:
         """About what goes to the camera of all LEDs together, from `Light.upward`: enough to tell noise."""
         steep = self.behind.coupling.lobes[:, -1]
-        maps = np.pad(np.einsum("i,niyx->yx", steep, upward), MARGIN)[None, None]
+        maps = np.pad(np.einsum("i,niyx->yx", steep, upward), self.margin)[None, None]
         return Seen(maps, np.zeros(1), np.zeros(1))
 
     def _upward(
-        self, entering: Array, tolerance: float, straight: Array | None = None
+        self, entering: Singles, tolerance: float, straight: Array | None = None
     ) -> tuple[Array, Array]:
         """V without the margin, and with it."""
-        wide = np.pad(entering, ((0, 0), (0, 0), (MARGIN, MARGIN), (MARGIN, MARGIN)))
+        beside = (self.margin, self.margin)
+        wide = np.pad(entering.astype(np.float64), ((0, 0), (0, 0), beside, beside))
         if straight is not None:
             wide[:, 0] = straight
         found = self.bed.solve(wide, tolerance)
-        return found[..., INSIDE, INSIDE], found
+        inside = slice(self.margin, -self.margin)
+        return found[..., inside, inside], found
+
+    @property
+    def margin(self) -> int:
+        """Cells beside the guide's face, on each side."""
+        return self.behind.passage.margin
 
     @property
     def _modes(self) -> int:

@@ -20,7 +20,7 @@ from .sensor import Sensor
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PixelRays:
     """Rays of the camera's pixels where they come into the guide, going up; of a guide in layers, where they
     come into the one under the contact.
@@ -30,7 +30,10 @@ class PixelRays:
     origin_mm, direction : (rows, columns, 3)
         Point on the face between guide and glass (on the first layer's lower face), and unit direction.
     transmittance : (rows, columns)
-        Fresnel transmittance of all faces together, unpolarised, with the reflections between them summed.
+        Fresnel transmittance of all faces together, unpolarised, with the reflections between them summed; 0
+        where an LED below is in the way.
+    mirrored : (rows, columns)
+        `faces_reflectance` at their angle.
     radiance_scale : float
         Radiance in air over radiance there of an unattenuated ray, 1/n² (conservation of étendue).
     """
@@ -38,6 +41,7 @@ class PixelRays:
     origin_mm: Array
     direction: Array
     transmittance: Array
+    mirrored: Array
     radiance_scale: float
 
 
@@ -122,9 +126,9 @@ def pixel_rays(sensor: Sensor) -> PixelRays:
         inside = _refract(in_air, layer.refractive_index)
         offset = offset + inside[..., :2] / inside[..., 2:] * layer.thickness_mm
     origin = np.concatenate([offset, np.full((*offset.shape[:2], 1), guide.floors_mm[0])], axis=-1)
-    transmittance = 1.0 - faces_reflectance(sensor, in_guide[..., 2])
-    transmittance = np.where(_blocked(sensor, in_air, in_glass), 0.0, transmittance)
-    return PixelRays(origin, in_guide, transmittance, 1.0 / guide.refractive_index**2)
+    mirrored = faces_reflectance(sensor, in_guide[..., 2])
+    transmittance = np.where(_blocked(sensor, in_air, in_glass), 0.0, 1.0 - mirrored)
+    return PixelRays(origin, in_guide, transmittance, mirrored, 1.0 / guide.refractive_index**2)
 
 
 def below_mm(sensor: Sensor) -> float:

@@ -90,11 +90,11 @@ def test_dielectric_faces_turn_light_as_mitsubas_do(met: dict[str, Any]) -> None
 
 
 def test_lanes_side_by_side_hold_every_path_once(variant: str) -> None:
-    from scenes import trace
+    from scenes import recurrence
 
-    order = np.array(trace.side_by_side(1000, 3)).reshape(3, 1000)
+    order = np.array(recurrence.side_by_side(1000, 3)).reshape(3, 1000)
     assert np.array_equal(np.sort(order, axis=1), np.tile(np.arange(1000), (3, 1)))
-    step = np.array(trace._RECURRENCE) / 2**32
+    step = np.array(recurrence._RECURRENCE) / 2**32
     points = (np.arange(2**14)[:, None] * step) % 1.0
-    jump = np.abs(np.diff(points[np.array(trace.side_by_side(2**14, 1))], axis=0)).max(axis=1)
+    jump = np.abs(np.diff(points[np.array(recurrence.side_by_side(2**14, 1))], axis=0)).max(axis=1)
     assert np.median(jump) < 0.25 * np.median(np.abs(np.diff(points, axis=0)).max(axis=1))

@@ -9,7 +9,7 @@ from twin.design import load_design
 from twin.doctor import Checkup, Exposure, Signal
 from twin.findings import RANKS, findings
 
-SINKS = ("tissue", "guide", "glass", "walls", "frame", "leds", "below", "aside")
+SINKS = ("tissue", "guide", "glass", "walls", "frame", "leds", "below", "aside", "housing")
 
 
 def sound(**changes):
@@ -20,7 +20,7 @@ def sound(**changes):
         camera=replace(design.camera, field_of_view_mm=20.0),
         specimen=replace(design.specimen, refractive_index=1.44),
     )
-    shares = dict(zip(SINKS, (20.0, 0.0, 0.0, 10.0, 5.0, 5.0, 10.0, 50.0), strict=True))
+    shares = dict(zip(SINKS, (20.0, 0.0, 0.0, 10.0, 5.0, 5.0, 10.0, 50.0, 0.0), strict=True))
     values = {
         "design": design,
         "indentation_mm": 2.0,
@@ -127,6 +127,7 @@ CASES = {
         "camera.field_of_view_mm",
         "within 0.5 mm",
     ),
+    "a white housing": (sound(from_housing_percent=12.3), "warning", "housing.reflectance", "12.3 %"),
     "uneven light": (sound(uniformity=25.0), "warning", "leds", "25 times"),
     "a weak LED": (sound(lit_percent=LIGHT), "note", "leds.0", "0.5 %"),
     "no light": (sound(advised_exposure_ms=None), "error", "camera", "no light"),

@@ -287,7 +287,7 @@ def test_walks_are_scored(variant, name, monkeypatch):
     import drjit as dr
     import mitsuba as mi
 
-    from scenes import build, trace
+    from scenes import build, recurrence, trace
     from scenes.answers import Answers
 
     monkeypatch.setattr(trace, "_SURE_BOUNCES", 10_000)
@@ -300,7 +300,7 @@ def test_walks_are_scored(variant, name, monkeypatch):
         build.put_surface(renderer.scene, sensor(), moved(name, off)[1])
         if name.startswith("skin."):
             build.put_surface(renderer.scene, moved(name, off)[0], press())
-        u = trace.evenly(trace.side_by_side(each, 2), np.arange(4))
+        u = recurrence.evenly(recurrence.side_by_side(each, 2), np.arange(4))
         ray, one = trace.emit(sensor(), number, u), dr.full(mi.Float, 1.0, 2 * each)
         parts = renderer.scene, sensor(), renderer.table, renderer.basis, number, ray, one
         return trace.walk(*parts, mi.UInt32(trace.IN_AIR), 5, answers, [mi.Float(0.0) * one])

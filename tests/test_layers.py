@@ -217,7 +217,7 @@ def test_trapped_share_of_an_isotropic_source_under_another_layer(
     import drjit as dr
     import mitsuba as mi
 
-    from scenes import Renderer, build, surface, trace
+    from scenes import Renderer, build, recurrence, surface, trace
 
     base = paper_sensor(columns=16, rows=12, pixel_um=(403.2, 403.2))
     led = dataclasses.replace(base.leds[0], diameter_mm=0.02, z_mm=-0.025)
@@ -230,7 +230,7 @@ def test_trapped_share_of_an_isotropic_source_under_another_layer(
     renderer = Renderer(wide, "cpu")
     build.put_surface(renderer.scene, wide, surface.flat(500.0, 0.0))
     count = 220_000
-    u = trace.evenly(dr.arange(mi.UInt32, count), np.array([11, 12, 13, 14]))
+    u = recurrence.evenly(dr.arange(mi.UInt32, count), np.array([11, 12, 13, 14]))
     height = dr.copysign(LEVEL + (1.0 - LEVEL) * dr.abs(2.0 * u[0] - 1.0), 2.0 * u[0] - 1.0)
     sine, (s, c) = dr.sqrt(1.0 - dr.square(height)), dr.sincos(dr.two_pi * u[1])
     direction = mi.Vector3f(sine * c, sine * s, height)

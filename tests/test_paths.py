@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from sensors import bump, paper_sensor
 
-from scenes.sensor import Glass, Sensor
+from scenes.sensor import Glass, Housing, Sensor
 
 INDEX = {"guide": 1.4336, "glass": 1.515, "air": 1.0}
 
@@ -98,15 +98,16 @@ def test_shares_are_those_of_the_weighted_walk(variant: str, coupling: Any) -> N
     import drjit as dr
     import mitsuba as mi
 
-    from scenes import paths, trace
+    from scenes import paths, recurrence, trace
 
     base = small(coupling)
     guide = dataclasses.replace(base.guide, absorption_per_mm=0.004)
-    renderer = rendered(dataclasses.replace(base, guide=guide), bump())
+    white = dataclasses.replace(base, guide=guide, housing=Housing(reflectance=0.5))
+    renderer = rendered(white, bump())
     scene, sensor, each = renderer.scene, renderer.sensor, 2**13
     found = paths.from_leds(scene, sensor, renderer.table, each, 3, bounces=256)
     number = dr.arange(mi.UInt32, 4 * each) // each
-    u = trace.evenly(dr.arange(mi.UInt32, 4 * each) % each, np.array([1, 2, 3, 4]))
+    u = recurrence.evenly(dr.arange(mi.UInt32, 4 * each) % each, np.array([1, 2, 3, 4]))
     ray, one = trace.emit(sensor, number, u), dr.full(mi.Float, 1.0, 4 * each)
     leg = dr.full(mi.UInt32, trace.OTHER, 4 * each)
     walked = trace.walk(scene, sensor, renderer.table, renderer.basis, number, ray, one, leg, 5)
@@ -130,7 +131,7 @@ def test_isotropic_source_in_an_unbounded_slab(variant: str) -> None:
     import drjit as dr
     import mitsuba as mi
 
-    from scenes import trace
+    from scenes import recurrence, trace
 
     base = small()
     led = dataclasses.replace(base.leds[0], diameter_mm=0.02, z_mm=-0.025)
@@ -142,7 +143,7 @@ def test_isotropic_source_in_an_unbounded_slab(variant: str) -> None:
     )
     renderer = rendered(wide)
     count = 220_000
-    u = trace.evenly(dr.arange(mi.UInt32, count), np.array([11, 12, 13, 14]))
+    u = recurrence.evenly(dr.arange(mi.UInt32, count), np.array([11, 12, 13, 14]))
     direction = mi.warp.square_to_uniform_sphere(mi.Point2f(u[0], u[1]))
     ray = mi.Ray3f(mi.Point3f(0.0, 0.0, -0.025), direction)
     number, one = dr.zeros(mi.UInt32, count), dr.full(mi.Float, 1.0, count)

@@ -197,7 +197,7 @@ def test_unpolarised_light_of_the_walk_is_the_models(variant: str, coupling: Any
     import drjit as dr
     import mitsuba as mi
 
-    from scenes import surface, trace
+    from scenes import recurrence, surface, trace
     from scenes.polarised import Polarised
 
     base = paper_sensor(coupling)
@@ -208,7 +208,7 @@ def test_unpolarised_light_of_the_walk_is_the_models(variant: str, coupling: Any
     number, start = both._from_leds(each, starts)
     left = both._walk((number, start), 5)
     parts = both.scene, sensor, both.table, both.basis, number
-    ray = trace.emit(sensor, number, trace.evenly(trace.side_by_side(each, 4), starts))
+    ray = trace.emit(sensor, number, recurrence.evenly(recurrence.side_by_side(each, 4), starts))
     plain = trace.walk(*parts, ray, dr.full(mi.Float, 1.0, 4 * each), mi.UInt32(trace.OTHER), 5)
 
     scale = np.abs(plain.maps).max()

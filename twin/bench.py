@@ -64,7 +64,8 @@ def optical_key(design: Design) -> tuple[Any, ...]:
     response = camera.quantum_efficiency if not isinstance(camera.quantum_efficiency, float) else None
     sensor = design.sensor()
     parts = sensor.guide, sensor.glass, sensor.leds, sensor.skin, sensor.tissue, sensor.effective_modulus_kPa
-    return (*seen, camera.colour, response, camera.pixel_um, design.light, *parts)
+    box = (design.housing,) if design.housing.reflects else ()
+    return (*seen, camera.colour, response, camera.pixel_um, design.light, *parts, *box)
 
 
 @dataclass

@@ -123,6 +123,13 @@ def inclusion_conflicts(design: Design, inclusion: Inclusion) -> Iterator[Design
         yield DesignError("inclusion.size", shown(inclusion.size), what)
 
 
+def black(design: Design, what: str) -> None:
+    """Raise `DesignError` if a design's housing reflects, which `what` cannot show."""
+    if design.housing.reflects:
+        allowed = f"0 (black) in {what}; `simulate`, `check` and corpora of traced light show others"
+        raise DesignError("housing.reflectance", shown(design.housing.reflectance), allowed)
+
+
 def colourless(design: Design, what: str) -> None:
     """Raise `DesignError` if a design's inclusion has optics of its own, which `what` cannot show."""
     if design.specimen.inclusion is not None:

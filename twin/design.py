@@ -24,7 +24,7 @@ import fem
 from fem.model import Length, Modulus, Offset, Poisson, Sides, Tilt
 from scenes import ies
 from scenes.led import Light
-from scenes.sensor import Camera, Glass, Guide, Led, Sensor
+from scenes.sensor import Camera, Glass, Guide, Housing, Led, Sensor
 from scenes.skin import Absorption, Anisotropy, Colour, RefractiveIndex, Scattering, Skin, Tissue
 from twin.complaint import DesignError, from_validation, not_finite, shown
 from twin.conflicts import design_conflicts, inclusion_conflicts
@@ -134,6 +134,7 @@ class Design:
     ] = "finite"
     light: Annotated[Light, Field(description="What light the LEDs give.")] = Light()
     glass: Annotated[Glass, Field(description="The rigid plate between waveguide and camera.")] = Glass()
+    housing: Annotated[Housing, Field(description="The box below the glass: black, or white.")] = Housing()
     surface: Annotated[
         Skin, Field(description="The contact between waveguide and tissue: roughness, film, dust, sheet.")
     ] = Skin()
@@ -212,6 +213,7 @@ class Design:
             effective_modulus_kPa=self.effective_modulus_kPa,
             wavelength_nm=wavelength,
             inclusion=self.specimen.inclusion,
+            housing=self.housing,
         )
 
     @property

@@ -112,6 +112,8 @@ class Checkup:
     """Monte Carlo noise of the pictures, per cent of their mean (rms)."""
     uniformity: float
     """Brightest over darkest hundredth of the light on plain tissue (untouched where there is no press)."""
+    from_housing_percent: float = 0.0
+    """Of the picture's light, what is a white housing, mirrored in glass and contact."""
     failures: tuple[str, ...] = ()
     """One line for each thing that could not be computed."""
     paths: Paths | None = field(default=None, repr=False)
@@ -230,6 +232,7 @@ def check_up(
         rim_mm=rim,
         noise_percent=lit.noise_percent,
         uniformity=_uniformity(lit),
+        from_housing_percent=lit.from_housing_percent,
         failures=tuple(failures),
         paths=recorded,
         height_mm=shape.rest_mm + shape.displacement_mm[..., 2],

@@ -31,6 +31,7 @@ _SEEN, _CLEAR = 3.0, 10.0  # signal over noise
 _MISSED, _LEAKED, _ASIDE, _FRAME = 15.0, 10.0, 60.0, 10.0  # per cent of the light
 _BACKGROUND = 0.5  # untouched over pressed, above black
 _UNEVEN = 10.0
+_VEIL = 5.0
 _RIM_MM = 1.5  # of the guide's edge where the pressed rim folds
 
 
@@ -259,6 +260,14 @@ def _losses(checkup: Checkup) -> Iterator[Finding]:
 
 def _picture(checkup: Checkup) -> Iterator[Finding]:
     design = checkup.design
+    if checkup.from_housing_percent > _VEIL:
+        yield Finding(
+            "warning",
+            "housing.reflectance",
+            f"{checkup.from_housing_percent:.1f} % of the picture's light is the housing, seen in the glass",
+            "It lies over the picture as a veil that no contact makes; its noise stays when it is tared",
+            "Blacken the inside (reflectance = 0)",
+        )
     camera, width = design.camera, design.waveguide.width_mm
     margin = (width - max(camera.field_of_view_mm, camera.field_height_mm)) / 2
     if margin < _RIM_MM:

@@ -20,7 +20,7 @@ from scipy.stats import qmc
 import fem
 from twin import presses
 from twin.complaint import DesignError, shown
-from twin.conflicts import colourless
+from twin.conflicts import black, colourless
 from twin.design import Design, parse_design
 from twin.fields import put, tables_of
 from twin.pooled import each
@@ -77,6 +77,7 @@ def learn_light(
 
     target = check_file(out, "out", ".npz")
     colourless(design, "learned light")
+    black(design, "learned light")
     if samples < 64:
         raise DesignError("samples", shown(samples), "64 or more")
     file = Path(emulator) if emulator is not None else presses.EMULATORS / f"{design.name}.npz"

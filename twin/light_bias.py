@@ -83,6 +83,8 @@ def _unlike(design: Design, alike: Mapping[str, Any]) -> Iterator[str]:
         yield "a contact sheet"
     if design.waveguide.walls != "polished":
         yield f"{design.waveguide.walls} walls"
+    if design.housing.reflects:
+        yield "a housing that reflects"
     # what the light sees, also where the design leaves it out
     told = {"waveguide.refractive_index": design.guide().refractive_index}
     told["waveguide.thickness_mm"] = design.waveguide.thickness_mm

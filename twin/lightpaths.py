@@ -29,6 +29,7 @@ _LINES = 70  # in one panel, about
 _LEAST = 2  # of every fate that an LED has; 1 where there are many LEDs
 _MANY = 6
 _BELOW_MM, _BESIDE_MM, _TISSUE_MM = 6.0, 6.0, 3.0  # drawn beyond the sensor
+_HOUSING_MM = 0.6  # thickness that is drawn
 _SIDES = {"x": 0, "y": 1}
 
 
@@ -203,6 +204,11 @@ def _draw_camera(axes: Axes, checkup: Checkup, across: int, lowest: float) -> No
     axes.add_patch(outline)
     for edge in cone:
         axes.plot(*np.array(edge).T, color="#2b8cbe", lw=0.7, ls=(0, (5, 3)), zorder=16)
+    if sensor.housing.reflects:
+        for side in (-1, 1):
+            x = side * (sensor.guide.width_mm / 2 + _HOUSING_MM * np.array([0.0, 1.0, 1.0, 0.0]))
+            z = lowest - _BELOW_MM * np.array([0.0, 0.0, 1.0, 1.0])
+            axes.fill(x, z, facecolor="white", edgecolor=INK, lw=0.5, hatch="////", zorder=5)
     axes.text(
         0,
         lowest - _BELOW_MM + 0.4,

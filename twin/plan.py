@@ -18,7 +18,7 @@ import numpy as np
 import fem
 from twin import presses
 from twin.complaint import DesignError, shown
-from twin.conflicts import colourless
+from twin.conflicts import black, colourless
 from twin.design import Design, load_design, parse_design, shipped_designs
 from twin.draws import check_bounds
 from twin.fields import expand, number_at, tables_of
@@ -87,6 +87,8 @@ def freeze(
     if light_file is None and settings.traced is not None:
         light_file = source.folder / settings.traced
     try:
+        if light_file is not None:
+            black(design, "learned light")
         if mechanics != "emulator":
             design = design.pressed(mechanics=mechanics)
         lit = light or settings.light or quality or settings.quality

@@ -36,7 +36,7 @@ SINKS_IN_WORDS = {
     "walls": "painted walls absorb",
     "frame": "glass's black frame",
     "leds": "LED bodies",
-    "housing": "housing",
+    "housing": "white housing absorbs",
     "below": "leaves below",
     "aside": "leaves aside, or never enters",
 }
@@ -102,6 +102,7 @@ def measured(checkup: Checkup) -> dict[str, Any]:
             "over_noise": signal.over_noise,
             "at_px": list(signal.at_px),
         },
+        "from_housing_percent": checkup.from_housing_percent,
         "rim_mm": checkup.rim_mm,
         "uniformity": checkup.uniformity if np.isfinite(checkup.uniformity) else None,
         "not_computed": list(checkup.failures),
@@ -181,6 +182,8 @@ def _balance(checkup: Checkup, width: int) -> Table:
     total = 100.0 * (checkup.emitted_W > 0) + checkup.closure_percent
     row(f"  together (100 ± {CLOSURE_PERCENT:g})", total, end_section=True)
     row("share of the picture's light", checkup.lit_percent, "{:.1f}")
+    if design.housing.reflects:
+        table.add_row(f"  mirrored housing in it: {checkup.from_housing_percent:.1f} %", style="dim")
     if len(design.leds) > len(shown):
         table.caption = f"{len(design.leds) - len(shown)} more LEDs: see --json"
     return table
