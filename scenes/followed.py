@@ -17,7 +17,6 @@ from . import recurrence, trace, transport
 from .answers import Answers
 from .bsdf import Table
 from .build import led_frame
-from .irradiance import smooth
 from .lamp import Patterns
 from .response import Basis, Landed, Response
 from .sensor import Sensor
@@ -37,7 +36,7 @@ class Emission:
 
 @dataclass(frozen=True)
 class Stage:
-    """A scene with its surface in place, and what is asked of it."""
+    """A scene with its surface in place, and what is asked of it; how tissue responds on the walks' cells."""
 
     scene: mi.Scene
     sensor: Sensor
@@ -49,12 +48,12 @@ class Stage:
 
 
 def follow(stage: Stage, lit: Array, samples: int, seed: int) -> Landed:
-    """Light that is not gathered, and its derivatives.
+    """Light that is not gathered, and its derivatives, as walks count it: on trace.CELLS a side, not smooth.
 
     Parameters
     ----------
     lit
-        `Response.upward` of the gathered light, (1 + q, n_led, modes, GRID, GRID).
+        `Response.upward` of the gathered light on those cells, (1 + q, n_led, modes, m, m).
     samples, seed
         As of `transport.transport`; the light itself is the same to the last bits.
     """
@@ -63,7 +62,7 @@ def follow(stage: Stage, lit: Array, samples: int, seed: int) -> Landed:
     each = max(samples // 2, 1)
     traced = _from_leds(stage, each, starts[0], 16 * seed)
     landed = traced
-    total = newest = response.again(traced) + lit
+    total = newest = response.again(traced.even()) + lit
     ratio, turn = np.ones(n_led), np.zeros((len(lit) - 1, n_led))
     for order in range(1, transport.ORDERS + 1):
         before = newest[:, :, 0].sum(axis=(2, 3))
@@ -71,7 +70,7 @@ def follow(stage: Stage, lit: Array, samples: int, seed: int) -> Landed:
             break
         count = max(each >> min(2 * order, 6), 2)
         landed = _from_tissue(stage, newest, count, starts[order], 16 * seed + order)
-        newest = response.again(landed)
+        newest = response.again(landed.even())
         total, traced = total + newest, traced + landed
         after = newest[:, :, 0].sum(axis=(2, 3))
         ratio = after[0] / np.maximum(before[0], 1e-300)
@@ -135,7 +134,7 @@ def _from_leds(stage: Stage, each: int, start: NDArray[np.integer], seed: int) -
 
 
 def _from_tissue(stage: Stage, upward: Array, each: int, start: NDArray[np.integer], seed: int) -> Landed:
-    """What light leaves that comes out of the tissue, (1 + q, n_led, modes, GRID, GRID)."""
+    """What light leaves that comes out of the tissue, (1 + q, n_led, modes, m, m)."""
     sensor, coupling = stage.sensor, stage.response.under.behind.coupling
     number, u = _lanes(sensor, each, start)
     parts = (stage.scene, sensor, stage.table, coupling, upward[0], number, u)
@@ -157,7 +156,7 @@ def _walked(
     scores: Sequence[mi.Float],
     paired: bool = False,
 ) -> Landed:
-    """What a walk leaves, smooth; `scale` (n_led,) is W of a throughput of 1."""
+    """What a walk leaves; `scale` (n_led,) is W of a throughput of 1."""
     sensor = stage.sensor
     dr.eval(ray, amount, *scores)
     parts = (stage.scene, sensor, stage.table, stage.basis, number, ray, amount, leg, seed)
@@ -165,10 +164,7 @@ def _walked(
     each = dr.width(number) // len(sensor.leds)
     area = (sensor.guide.width_mm / trace.CELLS) ** 2
     factor = (scale / each / area)[:, None, None, None]
-    finer = transport.GRID // trace.CELLS
-    return Landed(
-        *(smooth((maps * factor).astype(np.float32), finer) for maps in (found.maps, found.answers))
-    )
+    return Landed(*((maps * factor).astype(np.float32) for maps in (found.maps, found.answers)))
 
 
 def _lanes(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -51,17 +53,8 @@ def gap_transmittance(
     ValueError
         An argument outside the ranges above; the message names it.
     """
-    values = {
-        "n1": n1,
-        "n0": n0,
-        "n3": n3,
-        "gap_um": gap_um,
-        "cos_theta": cos_theta,
-        "wavelength_nm": wavelength_nm,
-    }
-    arrays = {name: np.asarray(value, dtype=np.float64) for name, value in values.items()}
-    _check(arrays, "gap_transmittance")
-    i1, i0, i3, gap, cos1, wavelength = np.broadcast_arrays(*arrays.values())
+    given = (n1, n0, n3, gap_um, cos_theta, wavelength_nm)
+    i1, i0, i3, gap, cos1, wavelength = _checked("gap_transmittance", given)
 
     k2 = i1**2 * (1.0 - cos1**2)  # squared tangential index, conserved through the stack
     w = i0**2 - k2
@@ -99,17 +92,8 @@ def gap_reflection(
     r_p is that of the magnetic field: -r_s at normal incidence. |r|² is 1 - T of `gap_transmittance`.
     Arguments and errors are those of it; complex arrays of the broadcast shape.
     """
-    values = {
-        "n1": n1,
-        "n0": n0,
-        "n3": n3,
-        "gap_um": gap_um,
-        "cos_theta": cos_theta,
-        "wavelength_nm": wavelength_nm,
-    }
-    arrays = {name: np.asarray(value, dtype=np.float64) for name, value in values.items()}
-    _check(arrays, "gap_reflection")
-    i1, i0, i3, gap, cos1, wavelength = np.broadcast_arrays(*arrays.values())
+    given = (n1, n0, n3, gap_um, cos_theta, wavelength_nm)
+    i1, i0, i3, gap, cos1, wavelength = _checked("gap_reflection", given)
 
     k2 = i1**2 * (1.0 - cos1**2)
     w, q1, q3 = i0**2 - k2, i1 * cos1, np.sqrt((i3**2 - k2).astype(complex))
@@ -127,7 +111,8 @@ def gap_reflection(
         c = z3 * cosine - 1j * times / squared
         return np.asarray((z1 * b - c) / (z1 * b + c))
 
-    return reflected(q1 + 0j, q3, 1.0), reflected(q1 / i1**2 + 0j, q3 / i3**2, i0**2)
+    z1 = q1.astype(np.complex128)
+    return reflected(z1, q3, 1.0), reflected(z1 / i1**2, q3 / i3**2, i0**2)
 
 
 def _sine_squared_over(w: Array, a: Array) -> Array:
@@ -139,17 +124,23 @@ def _sine_squared_over(w: Array, a: Array) -> Array:
     return a**2 * np.where(x > 1e-8, ratio, 1.0) ** 2
 
 
-def _check(arrays: dict[str, Array], law: str) -> None:
-    allowed = {
-        "n1": (1.0, np.inf),
-        "n0": (1.0, np.inf),
-        "n3": (1.0, np.inf),
-        "gap_um": (0.0, np.inf),
-        "cos_theta": (0.0, 1.0),
-        "wavelength_nm": (np.nextafter(0.0, 1.0), np.inf),
-    }
-    for name, (low, high) in allowed.items():
-        bad = ~((arrays[name] >= low) & (arrays[name] <= high) & np.isfinite(arrays[name]))
+_ALLOWED = {
+    "n1": (1.0, np.inf),
+    "n0": (1.0, np.inf),
+    "n3": (1.0, np.inf),
+    "gap_um": (0.0, np.inf),
+    "cos_theta": (0.0, 1.0),
+    "wavelength_nm": (np.nextafter(0.0, 1.0), np.inf),
+}
+"""Of a gap and the light that meets it, in the order of the arguments."""
+
+
+def _checked(law: str, given: Sequence[ArrayLike]) -> tuple[Array, ...]:
+    """A gap and its light, each within its range and all of one shape."""
+    arrays = [np.asarray(value, dtype=np.float64) for value in given]
+    for array, (name, (low, high)) in zip(arrays, _ALLOWED.items(), strict=True):
+        bad = ~((array >= low) & (array <= high) & np.isfinite(array))
         if np.any(bad):
-            received = arrays[name][bad].flat[0]
+            received = array[bad].flat[0]
             raise ValueError(f"{law}: {name}: received {received}; allowed {low:g} to {high:g}, finite")
+    return tuple(np.asarray(array) for array in np.broadcast_arrays(*arrays))

@@ -41,6 +41,7 @@ from .render import COLOUR, MOST_PASSES, PATHS_PER_LED, Renderer, passes
 from .response import Basis, Landed, Other, Response
 from .sensor import NotModelled, Sensor
 from .surface import OpticalSurface
+from .trace import CELLS
 
 Array = NDArray[np.float64]
 
@@ -137,18 +138,19 @@ def gradients(
         under = transport.Under.at(renderer.basis, renderer.behind, transport.survey(renderer.scene, sensor))
         others = [one.other for one in moves]
         response = Response.of(under, slopes, others)
+        walked_on = Response.of(under.coarser, under.ground.on_coarser(slopes), others)
         basis = Basis((renderer.basis, *(one.basis for one in others if one is not None)))
         straight = _gathered(renderer, basis, pressed, names, moves)
-        lit = response.upward(straight)
+        lit = walked_on.upward(straight.coarser())
         tables = [None if one is None else one.transmittance for one in others]
         answers = Answers.of(sensor.guide.width_mm, slopes, tables)
         emission = Emission(*(np.array([float(name == at) for name in names]) for at in _MOVING))
-        stage = Stage(renderer.scene, sensor, renderer.table, basis, response, answers, emission)
+        stage = Stage(renderer.scene, sensor, renderer.table, basis, walked_on, answers, emission)
         count, each = passes(samples, len(sensor.leds))
         walked = follow(stage, lit, each, seed * MOST_PASSES)
         for number in range(1, count):
             walked = walked + follow(stage, lit, each, seed * MOST_PASSES + number)
-        seen = response.seen(straight + walked.over(count))
+        seen = response.seen(straight + walked.over(count).even(transport.GRID // CELLS))
     sight = gather.look(renderer.scene, sensor, renderer.table, renderer.behind.coupling, renderer.rays)
     radiance = gather.picture(sight, seen[0], transport.MARGIN).astype(np.float64)
     found = np.empty((len(parameters), *radiance.shape))

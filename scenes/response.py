@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from .abreast import abreast
 from .irradiance import AngularBasis, Entrance, Weighing, by_fraction, transmitted
 from .passage import Face, Glimpse, Passage, Seen
-from .transport import INSIDE, MARGIN, Under
+from .transport import Under, coarser, even
 
 Array = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -88,14 +88,22 @@ class _Change:
 
 @dataclass(frozen=True)
 class Landed:
-    """Weighted irradiance (n_led, layers, GRID, GRID), W/mm², on all layers of a `Basis`, and its derivatives
-    (q, n_led, told, GRID, GRID) on the first."""
+    """Weighted irradiance (n_led, layers, m, m), W/mm², on all layers of a `Basis`, and its derivatives
+    (q, n_led, told, m, m) on the first."""
 
     light: Singles
     slopes: Singles
 
     def __add__(self, other: Landed) -> Landed:
         return Landed(self.light + other.light, self.slopes + other.slopes)
+
+    def even(self, factor: int = 1) -> Landed:
+        """Smooth, on cells so many times finer."""
+        return Landed(even(self.light, factor), even(self.slopes, factor))
+
+    def coarser(self) -> Landed:
+        """On the cells that walks are counted on."""
+        return Landed(coarser(self.light), coarser(self.slopes))
 
     def over(self, count: int) -> Landed:
         """So many times less."""
@@ -111,17 +119,17 @@ class Response:
 
     @staticmethod
     def of(under: Under, slopes: Array, others: Sequence[Other | None]) -> Response:
-        """From the derivatives of the contact fraction on its cells, (q, GRID, GRID), and of the optics."""
+        """From the derivatives of the contact fraction on its cells, (q, m, m), and of the optics."""
         basis, behind, fraction = under.entrance.basis, under.behind, under.ground.fraction
-        wide = np.pad(fraction, MARGIN)
-        bare = np.pad(np.zeros(fraction.shape, bool), MARGIN, constant_values=True)
+        wide = np.pad(fraction, under.margin)
+        bare = np.pad(np.zeros(fraction.shape, bool), under.margin, constant_values=True)
         first, changes = basis.layers, []
         for slope, other in zip(slopes, others, strict=True):
             entrances, held = [], np.zeros((*behind.coupling.free.shape, *wide.shape))
             faces = [np.zeros((*free.shape, *wide.shape)) for free in behind.coupling.thrown_free[:2]]
             if slope.any():
                 entrances.append((_steep(basis, fraction, slope), slice(0, basis.layers)))
-                risen = np.pad(slope, MARGIN)
+                risen = np.pad(slope, under.margin)
                 held += _by_node(_rise(behind.coupling.held), wide, risen)
                 for face, table in zip(faces, behind.coupling.thrown, strict=False):
                     face += _by_node(_rise(table), wide, risen)
@@ -140,20 +148,22 @@ class Response:
         return Response(under, changes)
 
     def again(self, landed: Landed) -> Array:
-        """`Under.again` of all, (1 + q, n_led, modes, GRID, GRID)."""
+        """`Under.again` of all, (1 + q, n_led, modes, m, m)."""
+        inside = self.under.inside
 
         def one(number: int) -> Array:
-            return self._solved(self._entering(landed, number, self._modes), 1e-3)[..., INSIDE, INSIDE]
+            return self._solved(self._entering(landed, number, self._modes), 1e-3)[..., inside, inside]
 
         return np.stack(abreast(one, len(landed.light)), axis=1)
 
     def upward(self, landed: Landed) -> Array:
         """`Under.upward` of all."""
+        inside = self.under.inside
 
         def one(number: int) -> Array:
             entering = self._entering(landed, number)
             straight = self._passage.enter(entering, glimpse=False)[0]
-            return self._solved(entering[:, : self._modes], 1e-3, straight)[..., INSIDE, INSIDE]
+            return self._solved(entering[:, : self._modes], 1e-3, straight)[..., inside, inside]
 
         return np.stack(abreast(one, len(landed.light)), axis=1)
 
@@ -189,7 +199,7 @@ class Response:
         return seen
 
     def _entering(self, landed: Landed, number: int, only: int | None = None) -> Array:
-        """`irradiance.transmitted` of one LED's light and its derivatives, (1 + q, functions, GRID, GRID)."""
+        """`irradiance.transmitted` of one LED's light and its derivatives, (1 + q, functions, m, m)."""
         entrance, meets = self.under.entrance, self.under.ground.meets
         light = landed.light[number : number + 1]
         lights = np.concatenate([light[:, : entrance.basis.layers], landed.slopes[:, number]])
@@ -201,7 +211,8 @@ class Response:
 
     def _solved(self, entering: Array, tolerance: float, straight: Array | None = None) -> Array:
         """V of one LED's light and of its derivatives, with the margin."""
-        wide = np.pad(entering, ((0, 0), (0, 0), (MARGIN, MARGIN), (MARGIN, MARGIN)))
+        beside = (self.under.margin, self.under.margin)
+        wide = np.pad(entering, ((0, 0), (0, 0), beside, beside))
         if straight is not None:
             wide[:, 0] = straight
         return self._answered(wide, tolerance)

@@ -29,7 +29,6 @@ Singles = NDArray[np.float32]
 
 GRID = 200  # cells of the maps per side
 MARGIN = 30  # cells beside them, in which light comes out of bare skin
-INSIDE = slice(MARGIN, MARGIN + GRID)
 ORDERS = 12  # of re-emission at most
 _LEAST_SHARE = 1e-6
 ENOUGH = 3e-3  # share of the light below which the orders to come are estimated
@@ -79,8 +78,11 @@ class Ground:
 
     def coarser(self) -> Ground:
         """On the cells that walks are counted on."""
-        meets = coarser(self.meets)
-        return Ground(coarser(self.fraction * self.meets) / np.maximum(meets, _LEAST_SHARE), meets)
+        return Ground(self.on_coarser(self.fraction), coarser(self.meets))
+
+    def on_coarser(self, values: Array) -> Array:
+        """Means (..., trace.CELLS, trace.CELLS) of values (..., m, m) over the surface within those cells."""
+        return np.asarray(coarser(values * self.meets) / np.maximum(coarser(self.meets), _LEAST_SHARE))
 
 
 @dataclass(frozen=True)
@@ -314,8 +316,12 @@ class Under:
         if straight is not None:
             wide[:, 0] = straight
         found = self.bed.solve(wide, tolerance)
-        inside = slice(self.margin, -self.margin)
-        return found[..., inside, inside], found
+        return found[..., self.inside, self.inside], found
+
+    @property
+    def inside(self) -> slice:
+        """The guide's face on cells with the margin, along either axis."""
+        return slice(self.margin, -self.margin)
 
     @property
     def margin(self) -> int:

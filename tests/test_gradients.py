@@ -232,28 +232,6 @@ def test_gathered_light_is_differentiated_through_its_loops(variant, lower, name
         assert size(-found - expected) > size(expected), name
 
 
-@pytest.mark.parametrize(
-    ("parameter", "says"),
-    [
-        ("leds.power", "allowed: leds.flux_W"),
-        ("leds.exponent", "allowed: 'power'"),
-        ("leds.z_mm", "allowed: LEDs at the sides"),
-        ("pressure", "where skin.contact is 'rough'"),
-    ],
-)
-def test_what_a_sensor_has_not_is_refused(variant, parameter, says):
-    """In one line, before anything is computed."""
-    from scenes.gradients import gradients
-    from scenes.render import Renderer
-
-    one = paper_sensor(columns=16, rows=16, pixel_um=(403.0, 300.0))
-    leds = (replace(one.leds[0], side="below"),)
-    renderer = Renderer(replace(one, leds=leds, skin=Skin(contact="full")), device="cpu")
-    with pytest.raises(ValueError, match=says) as refused:
-        gradients(renderer, press(), [parameter])
-    assert "\n" not in str(refused.value)
-
-
 def test_derivatives_come_with_the_picture(variant):
     """The picture is the renderer's own, bit for bit; that of the flux is the picture over the flux; every
     parameter answers."""
