@@ -67,9 +67,17 @@ def on(sensor: Sensor, basis: Layered, ground: Array, points: int = DISC_POINTS)
             found[here] = on(some, basis, ground, points)
         return found
     led, where = _targets(sensor, ground)
-    total, count = _summed(sensor, basis, _sources(sensor, led), where, points)
-    dr.eval(total)
-    return _maps(total, n_led) / np.float32(count)
+    return _maps(at(sensor, basis, led, where, points), n_led)
+
+
+def at(
+    sensor: Sensor, basis: Layered, led: mi.UInt32, here: list[mi.Float], points: int = DISC_POINTS
+) -> list[mi.Float]:
+    """The same on the device, layer by layer; each lane has its LED and target: x, y, height, mm, slopes."""
+    total, count = _summed(sensor, basis, _sources(sensor, led), here, points)
+    found = [layer * (1.0 / count) for layer in total]
+    dr.eval(found)
+    return found
 
 
 def answers(

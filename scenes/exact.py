@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from . import recurrence, trace, wander
+from . import recurrence, trace, transport, wander
 from .bsdf import Table
 from .faces import CONTACT, HOUSING, NOTHING, Faces
 from .housing import Tally
@@ -147,6 +147,7 @@ def exact(
     seed: int,
     *,
     local: bool = False,
+    gathered: Array | None = None,
     slopes: Array | None = None,
     place: tuple[Array, Array] | None = None,
     tally: Tally | None = None,
@@ -164,6 +165,9 @@ def exact(
     local
         Take tissue for the diffuse lobe of the scene's BSDF, which sends light back where it came in: what
         stock `path` sees.
+    gathered
+        Radiance (n_led, rows, columns) of `local.straight`: paths that it has are then left out of what is
+        seen directly, and it takes their place, without noise. Only with `local`.
     slopes
         Derivatives of `fraction` to q parameters, (q, m, m): what is seen is followed by its derivatives, by
         the paths' scores (`wander.Spots`). Not with `local`.
@@ -180,6 +184,8 @@ def exact(
     """
     if local and slopes is not None:
         raise ValueError("slopes: received some with local; allowed only without")
+    if gathered is not None and not local:
+        raise ValueError("gathered: received some without local; allowed only with it")
     per = np.ones(0) if slopes is None else np.maximum(np.abs(slopes).max(axis=(1, 2)), 1e-30)
     even = None if slopes is None else slopes / per[:, None, None]  # of like size: digits do not run out
     n_led = len(sensor.leds)
@@ -200,10 +206,10 @@ def exact(
     sequence = dr.arange(mi.UInt64, n_led * samples) + 1
     random = mi.PCG32(size=n_led * samples, initstate=dr.opaque(mi.UInt64, seed), initseq=sequence)
 
-    def going(ray, throughput, bounce, alive, random, *scores):  # type: ignore[no-untyped-def]
+    def going(ray, throughput, bounce, leg, alive, random, *scores):  # type: ignore[no-untyped-def]
         return alive
 
-    def step(ray, throughput, bounce, alive, random, *scores):  # type: ignore[no-untyped-def]
+    def step(ray, throughput, bounce, leg, alive, random, *scores):  # type: ignore[no-untyped-def]
         met = faces.meet(ray, alive)
         for lost in trace.absorb(sensor, ray, met, throughput).values():
             throughput = throughput - lost
@@ -217,13 +223,15 @@ def exact(
         if local:
             # what leaves towards the camera is known before it is drawn
             glow = throughput * through * dr.inv_pi
-            for view in views:
+            for view, known in zip(views, (gathered is not None, False), strict=True):
                 down = view.towards(met.p)
                 off = dr.dot(met.normal, down)
                 off_unit = off * dr.rcp(dr.norm(down))
                 seen = table.transmittance(met.fraction, off_unit, touches)
                 seen *= table.diffuse(met.fraction, met.cosine, off_unit, touches)
-                view.add(number, met.p, [glow * seen * dr.dot(met.n, down)], touches & (off > 0.0))
+                counts = touches & (off > 0.0)
+                counts &= ~trace.is_gathered(leg) if known else True
+                view.add(number, met.p, [glow * seen * dr.dot(met.n, down)], counts)
             si = scene.ray_intersect(ray, touches)
             scattered, weight = si.bsdf(ray).sample(context, si, u1, u2, touches)
             direction = dr.select(touches, si.to_world(scattered.wo), direction)
@@ -245,18 +253,24 @@ def exact(
         kept = throughput * share
         survive = dr.select(bounce < _SURE_BOUNCES, 1.0, dr.minimum(kept, 0.95))
         alive = alive & (kept > 0.0) & (random.next_float32() < survive) & (bounce < _MAX_BOUNCES)
-        return following, dr.select(alive, kept / survive, 0.0), bounce + 1, alive, random, *scores
+        passed = alive & ~touches & (met.cosine * dr.dot(following.d, met.normal) < 0.0)
+        leg = trace.next_leg(leg, met.kind, passed)
+        return following, dr.select(alive, kept / survive, 0.0), bounce + 1, leg, alive, random, *scores
 
     ray = trace.emit(sensor, number, recurrence.evenly(place, starts))
     begin = (ray, dr.full(mi.Float, 1.0, n_led * samples))
     still = [dr.zeros(mi.Float, n_led * samples) for _ in per]
-    dr.while_loop((*begin, mi.UInt32(0), mi.Bool(True), random, *still), going, step)
+    legs = mi.UInt32(np.array([transport.first_leg(led) for led in sensor.leds], dtype=np.uint32))
+    leg = dr.gather(mi.UInt32, legs, number)
+    dr.while_loop((*begin, mi.UInt32(0), leg, mi.Bool(True), random, *still), going, step)
     scale = np.array([led.flux_W for led in sensor.leds])[:, None, None] / samples
     if not local:
         scale = scale * squeezed
     found = np.stack(
         [scale * view.collected() / film.area_mm2 for view, film in zip(views, films, strict=True)], axis=1
     )
+    if gathered is not None:
+        found[0, 0] += gathered
     if slopes is None:
         return found[0]
     found[1:] *= per[:, None, None, None, None]

@@ -98,7 +98,7 @@ def look(scene: mi.Scene, sensor: Sensor, table: Table, coupling: Coupling, rays
 def glance(scene: mi.Scene, sensor: Sensor, table: Table, coupling: Coupling, rays: PixelRays) -> Glance:
     """The same, not evaluated: Dr.Jit differentiates it to the scene's surface and to the table."""
     guide = sensor.guide
-    origin, direction, gain, mirrored = _on_device(rays)
+    origin, direction, gain, mirrored = on_device(rays)
     contact = next(shape for shape in scene.shapes() if shape.id() == "contact")
 
     named = {shape.id(): mi.ShapePtr(shape) for shape in scene.shapes()}
@@ -161,7 +161,7 @@ def _housing(
 ) -> list[housing.Mirror]:
     """How pixels see the housing: straight by the faces below, and from a point of the contact that mirrors
     this share of radiance in the guide. Slopes there are left out, and so are ways with two mirrors."""
-    n, (_, _, clear, mirrored) = sensor.guide.refractive_index, _on_device(rays)
+    n, (_, _, clear, mirrored) = sensor.guide.refractive_index, on_device(rays)
     sine_x, sine_y = n * direction.x, n * direction.y  # in air
     in_air = dr.rsqrt(dr.maximum(1.0 - dr.square(sine_x) - dr.square(sine_y), 1e-6))
     lean_x, lean_y = sine_x * in_air, sine_y * in_air
@@ -176,7 +176,7 @@ def _housing(
 
 
 @lru_cache(maxsize=4)
-def _on_device(rays: PixelRays) -> tuple[mi.Point3f, mi.Vector3f, mi.Float, mi.Float]:
+def on_device(rays: PixelRays) -> tuple[mi.Point3f, mi.Vector3f, mi.Float, mi.Float]:
     """Origin, direction, radiance at the camera over that in the guide, and `mirrored`, pixel after pixel."""
     points = np.moveaxis(np.concatenate([rays.origin_mm, rays.direction], axis=-1), -1, 0)
     gain = rays.transmittance * rays.radiance_scale

@@ -132,7 +132,7 @@ def walk(
 
         cosine = met.cosine
         on_contact = alive & (met.kind == CONTACT) & (cosine > 0.0)
-        gathered = on_contact & ((leg == IN_GUIDE) | (leg == _BACK_UP))  # `direct` has counted these
+        gathered = on_contact & is_gathered(leg)
         # folded against a wall, the rim stands upright: the map, seen from below, has no area there
         lands = on_contact & ~gathered & (met.n.z < -0.5)
         column = mi.UInt32(dr.clip((met.p.x / width + 0.5) * CELLS, 0.0, CELLS - 1.0))
@@ -167,7 +167,7 @@ def walk(
         sink["housing"] += dr.select(on_housing, stopped, 0.0)
         sink["frame"] += dr.select(on_led | on_wall | on_housing, 0.0, stopped)
         passed = elsewhere & (cosine * dr.dot(direction, met.normal) < 0.0)
-        leg = _next_leg(leg, met.kind, passed)
+        leg = next_leg(leg, met.kind, passed)
 
         survive = dr.select(bounce < _SURE_BOUNCES, 1.0, dr.minimum(kept, 0.95))
         alive = alive & (kept > 0.0) & (random.next_float32() < survive) & (bounce < _MAX_BOUNCES)
@@ -361,7 +361,12 @@ def painted(sensor: Sensor, met: Meeting, active: mi.Bool) -> mi.Bool:
     return found
 
 
-def _next_leg(leg: mi.UInt32, kind: mi.UInt32, passed: mi.Bool) -> mi.UInt32:
+def is_gathered(leg: mi.UInt32) -> mi.Bool:
+    """Whether `direct` counts light that comes to the contact on this leg."""
+    return (leg == IN_GUIDE) | (leg == _BACK_UP)
+
+
+def next_leg(leg: mi.UInt32, kind: mi.UInt32, passed: mi.Bool) -> mi.UInt32:
     """The leg after an event at a face of this kind, `passed` if light went through it."""
     following = mi.UInt32(OTHER)
     for before, event, after in (

@@ -177,7 +177,7 @@ def _balance(checkup: Checkup, width: int) -> Table:
         if key == "tissue" and design.surface.sheet is not None:
             words = "contact sheet keeps"
         row(f"  {words}", part)
-        if key == "below":
+        if key == ("housing" if design.housing.reflects else "below"):
             row("    of it into the camera", checkup.detected, "{:.2g}", style="dim")
     total = 100.0 * (checkup.emitted_W > 0) + checkup.closure_percent
     row(f"  together (100 ± {CLOSURE_PERCENT:g})", total, end_section=True)
