@@ -103,12 +103,13 @@ def test_equal_noise_sooner_than_path(variant: str, coupling: str) -> None:
 
 
 def _frames(folder: str, worker: int, ready: Barrier, told: Queue[Shift]) -> None:
-    """As one of `twin corpus`' workers, with one thread: FRAMES frames, each of another pressure."""
-    from scenes import Renderer, backend, expose
+    """As one of `twin corpus`' workers: FRAMES frames, each of another pressure."""
+    from twin.labour import prepare
+
+    prepare()
+    from scenes import Renderer, expose
     from scenes.exr import write_png
 
-    backend.use("cpu")
-    backend.threads(1)
     renderer, surface, rng = Renderer(sensor(), device="cpu"), blob(), np.random.Generator(np.random.PCG64(1))
     resident: list[float] = []
     start = processor = 0.0
