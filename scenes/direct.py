@@ -17,20 +17,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .build import floats
+from .disc import disc_rule
 from .disc_rays import Source, arrives, first_guess
 from .irradiance import Layered
 from .sensor import Sensor
-from .sunflower import disc_points
 from .surface import OpticalSurface, heights
 
 Array = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
 CELLS = 200  # of the grid of target points, per side
-DISC_POINTS = 96
-_NEWTON_AGAIN = 1, 2  # from what the disc's point before foretold, if there are so many points, or fewer
-_DIRECTIONS = 24  # of a disc: neighbouring points' light counts as coming from its mean direction
-_FINER = 4  # times the points
+DISC_POINTS = 24
+_NEWTON_AGAIN = 2  # steps from what the disc's point before foretold
+_FINER = 16  # times the points
 _NEWTON_LAYERS = 5  # in a guide of layers, whose faces a disc may cross
 
 
@@ -50,7 +49,7 @@ def direct(sensor: Sensor, basis: Layered, deformed: OpticalSurface) -> Singles:
 
 def on(sensor: Sensor, basis: Layered, ground: Array, points: int = DISC_POINTS) -> Singles:
     """Weighted irradiance of the two families on a `relief`, (n_led, layers, CELLS, CELLS), W/mm²,
-    from so many points of each disc, four times as many where one lies across a face between layers.
+    from so many points of each disc, sixteen times as many where one lies across a face between layers.
 
     From a disc of flux F and area A in a medium of index m, Lambertian or else with its pattern's factor
     (`lamp.Patterns.relative`), the element dA sends F/(pi A m²) dA
@@ -74,8 +73,7 @@ def at(
     sensor: Sensor, basis: Layered, led: mi.UInt32, here: list[mi.Float], points: int = DISC_POINTS
 ) -> list[mi.Float]:
     """The same on the device, layer by layer; each lane has its LED and target: x, y, height, mm, slopes."""
-    total, count = _summed(sensor, basis, _sources(sensor, led), here, points)
-    found = [layer * (1.0 / count) for layer in total]
+    found = _summed(sensor, basis, _sources(sensor, led), here, points)
     dr.eval(found)
     return found
 
@@ -101,11 +99,11 @@ def answers(
         _, moves = _targets(some, change.ground)
         where[2:] = [at + step * move for at, move in zip(where[2:], moves[2:], strict=True)]
     sources = [_moved(source, change, step) for source in _sources(some, led)]
-    total, count = _summed(some, basis, sources, where, points)
+    total = _summed(some, basis, sources, where, points)
     dr.forward(step)
     slopes = dr.grad(total)
     dr.eval(slopes)
-    found[here] = _maps(slopes, len(here)) / count
+    found[here] = _maps(slopes, len(here))
     return found
 
 
@@ -122,7 +120,7 @@ class Change:
 
 def crossed(sensor: Sensor) -> bool:
     """Whether a face between layers crosses an LED's disc, so that its points count in whole numbers here and
-    there: 1 % off with 96 of them."""
+    there."""
     ends = (
         (led.z_mm - floor) / (led.diameter_mm / 2)
         for led in sensor.leds
@@ -159,13 +157,11 @@ def _maps(total: list[mi.Float], n_led: int) -> Singles:
 
 def _summed(
     sensor: Sensor, basis: Layered, sources: list[Source], here: list[mi.Float], points: int
-) -> tuple[list[mi.Float], int]:
-    """Layers of weighted irradiance of each lane's target, summed over the points of its LED's disc; and the
-    number of these."""
-    steps = _NEWTON_LAYERS if sensor.guide.lower else _NEWTON_AGAIN[points < DISC_POINTS]
-    together = dr.opaque(mi.UInt32, max(points // _DIRECTIONS, 1))
-    points *= _FINER if crossed(sensor) else 1
-    disc, end = floats(disc_points(points)), dr.opaque(mi.UInt32, points)
+) -> list[mi.Float]:
+    """Layers of weighted irradiance of each lane's target, over the points of its LED's disc."""
+    steps = _NEWTON_LAYERS if sensor.guide.lower else _NEWTON_AGAIN
+    places, shares = disc_rule(points * (_FINER if crossed(sensor) else 1))
+    disc, share, end = floats(places), floats(shares), dr.opaque(mi.UInt32, len(shares))
     weights, lanes = basis.weights(), dr.width(sources[0].number)
     entered = [layer for layer in range(len(sources)) if _enters(sensor, layer)]
     families = [(layer, by_glass) for layer in entered for by_glass in (False, True)]
@@ -174,39 +170,23 @@ def _summed(
         return number < end
 
     def add(number, *state):  # type: ignore[no-untyped-def]
-        until = dr.minimum(number + together, end)
-
-        def within(number, *state):  # type: ignore[no-untyped-def]
-            return number < until
-
-        def gather(number, *state):  # type: ignore[no-untyped-def]
-            on_disc = dr.gather(mi.Point2f, disc, number)
-            onwards = dr.gather(mi.Point2f, disc, dr.minimum(number + 1, end - 1)) - on_disc
-            slopes, after = [], []
-            for k, (layer, by_glass) in enumerate(families):
-                whole, *parts = state[len(families) + 4 * k :][:4]
-                flux, arriving, slope = arrives(
-                    sensor, sources[layer], on_disc, here, by_glass, state[k], onwards, steps
-                )
-                after += [whole + flux]
-                after += [so_far + flux * part for so_far, part in zip(parts, arriving, strict=True)]
-                slopes.append(slope)
-            return number + 1, *slopes, *after
-
-        slopes, total = state[: len(families)], state[len(families) :]
-        nothing = [mi.Float(0.0) for _ in range(4 * len(families))]
-        number, *found = dr.while_loop((number, *slopes, *nothing), within, gather)
-        for k in range(len(families)):
-            flux, *arriving = found[len(families) + 4 * k :][:4]
-            cosine, d_x, d_y = (part / dr.maximum(flux, 1e-30) for part in arriving)
+        on_disc = dr.gather(mi.Point2f, disc, number)
+        onwards = dr.gather(mi.Point2f, disc, dr.minimum(number + 1, end - 1)) - on_disc
+        counts = dr.gather(mi.Float, share, number)
+        slopes, total = [], list(state[len(families) :])
+        for k, (layer, by_glass) in enumerate(families):
+            flux, (cosine, d_x, d_y), slope = arrives(
+                sensor, sources[layer], on_disc, here, by_glass, state[k], onwards, steps
+            )
             weight = weights.at(cosine, d_x, d_y, flux > 0.0)
-            total = tuple(whole + flux * w for whole, w in zip(total, weight, strict=True))
-        return number, *found[: len(families)], *total
+            total = [whole + counts * flux * w for whole, w in zip(total, weight, strict=True)]
+            slopes.append(slope)
+        return number + 1, *slopes, *total
 
     first = dr.gather(mi.Point2f, disc, dr.zeros(mi.UInt32, lanes))
     begin = [first_guess(sensor, sources[layer], first, here, by_glass) for layer, by_glass in families]
     state = (mi.UInt32(0), *begin, *(mi.Float(0.0) for _ in range(basis.layers)))
-    return list(dr.while_loop(state, more, add))[1 + len(families) :], points
+    return list(dr.while_loop(state, more, add))[1 + len(families) :]
 
 
 def _enters(sensor: Sensor, layer: int) -> bool:

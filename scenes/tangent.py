@@ -25,7 +25,6 @@ Array = NDArray[np.float64]
 
 _HEIGHT_MM = 0.05  # of the differences: far above rounding, far below an LED's size
 _SLOPE = 0.01
-_POINTS = 32  # of an LED's disc: slopes need not be as fine as the light
 
 
 @dataclass(frozen=True)
@@ -62,7 +61,7 @@ def gathered(renderer: Renderer, shape: OpticalSurface) -> Straight:
         for sign in (1.0, -1.0):
             moved = relief.copy()
             moved[number] += sign * step
-            ends.append(direct.on(sensor, basis, moved, _POINTS))
+            ends.append(direct.on(sensor, basis, moved))
         slopes.append(((ends[0] - ends[1]) / (2.0 * step)).astype(np.float32))
     return Straight(relief, direct.on(sensor, basis, relief).astype(np.float64), np.stack(slopes))
 

@@ -170,11 +170,11 @@ def test_fewer_points_of_a_disc_find_the_same_rays(variant):
     everything = AngularBasis(np.ones((1, 2, 1)), np.ones((1, 2)))
     sensor = paper_sensor("air")
     ground = relief(sensor, flat(sensor.guide.width_mm, -0.1))
-    few, many = (on(sensor, everything, ground, points)[:, 0] for points in (32, 96))
+    few, many = (on(sensor, everything, ground, points)[:, 0] for points in (12, 24))
     assert np.abs(few - many).mean() < 0.01 * many.mean()
 
 
-@pytest.mark.parametrize("points", [32, 96])
+@pytest.mark.parametrize("points", [12, 24])
 def test_rays_land_where_they_should(variant, monkeypatch, points):
     """What the point before foretold is so near that more steps of Newton's method change nothing."""
     from scenes import direct
@@ -184,6 +184,6 @@ def test_rays_land_where_they_should(variant, monkeypatch, points):
     sensor = paper_sensor("air")
     ground = direct.relief(sensor, flat(sensor.guide.width_mm, -0.1))
     found = direct.on(sensor, everything, ground, points)
-    monkeypatch.setattr(direct, "_NEWTON_AGAIN", (8, 8))
+    monkeypatch.setattr(direct, "_NEWTON_AGAIN", 8)
     exact = direct.on(sensor, everything, ground, points)
     assert np.sqrt(((found - exact) ** 2).mean()) < 2e-4 * exact.mean()
