@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
+from typing import Any
 
 import pytest
 from sensors import paper_sensor
@@ -27,6 +29,13 @@ CROSSED = replace(
 )
 
 
+@cache
+def _renderer(sensor: Sensor) -> Any:
+    from scenes.render import Renderer
+
+    return Renderer(sensor, device="cpu")
+
+
 @pytest.mark.parametrize(
     ("sensor", "parameter", "says"),
     [
@@ -41,8 +50,7 @@ CROSSED = replace(
 )
 def test_what_a_sensor_has_not_is_refused(variant: str, sensor: Sensor, parameter: str, says: str) -> None:
     from scenes.gradients import gradients
-    from scenes.render import Renderer
 
     with pytest.raises(ValueError, match=says) as refused:
-        gradients(Renderer(sensor, device="cpu"), flat(sensor.guide.width_mm, 1.0), [parameter])
+        gradients(_renderer(sensor), flat(sensor.guide.width_mm, 1.0), [parameter])
     assert "\n" not in str(refused.value)
