@@ -94,8 +94,8 @@ def groups_of(dofs: Ints, centres: Floats) -> Groups:
     )
 
 
-def dissect(mesh: Groups, last: Bools) -> Dissection:
-    """Halve the elements down to small sets; those of `last` (elements,) join the others at the very top."""
+def dissect(mesh: Groups) -> Dissection:
+    """Halve the elements down to small sets."""
     leaves: list[Ints] = []
     children: list[tuple[int, ...]] = []
 
@@ -106,10 +106,7 @@ def dissect(mesh: Groups, last: Bools) -> Dissection:
         children.append(under)
         return len(leaves) - 1
 
-    trunks = tuple(grow(part) for part in (np.flatnonzero(~last), np.flatnonzero(last)) if len(part))
-    if len(trunks) > 1:
-        leaves.append(np.empty(0, dtype=np.int64))
-        children.append(trunks)
+    grow(np.arange(len(mesh.slots)))
     pivots, borders = eliminate(mesh, leaves, children)
     turn = _thrifty(mesh, children, pivots, borders)
     place = np.argsort(turn)

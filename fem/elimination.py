@@ -33,8 +33,6 @@ def factorise(
     tree: Tree,
     matrices: Array | Callable[[Ints], Array],
     panels: list[Array],
-    left: dict[int, Array],
-    again: bool = False,
     progress: Callable[[float], None] | None = None,
 ) -> None:
     """Fill the panels of the factor.
@@ -44,52 +42,36 @@ def factorise(
     matrices
         Symmetric element matrices (elements, k, k), or a function that makes some of them.
     panels
-        From `room`: zeros to be filled, of all batches or of the volatile ones only.
-    left
-        What unchanging fronts leave to changing ones is put here.
-    again
-        Only the volatile fronts, with `left` from before.
+        From `room`: zeros to be filled.
 
     Raises
     ------
     LinAlgError
         If the matrix is not positive definite.
     """
-    kept = {c for f in tree.fronts if f.volatile for c in f.children if not tree.fronts[c].volatile}
-    todo = [i for i, f in enumerate(tree.fronts) if f.volatile or not again]
-    work = np.cumsum([1.0 + float(tree.fronts[i].size) ** 2 * tree.fronts[i].pivots for i in todo])
-    leaves = _leaves(matrices, [tree.fronts[i].elements for i in todo if len(tree.fronts[i].elements)])
-    memory = _Memory(tree, todo, kept, panels[0].dtype)
-    for i, done in zip(todo, work / work[-1:], strict=True):
-        front = tree.fronts[i]
+    work = np.cumsum([1.0 + float(front.size) ** 2 * front.pivots for front in tree.fronts])
+    leaves = _leaves(matrices, [front.elements for front in tree.fronts if len(front.elements)])
+    memory = _Memory(tree, panels[0].dtype)
+    for i, (front, done) in enumerate(zip(tree.fronts, work / work[-1:], strict=True)):
         blocks = memory.front(i)
         if len(front.elements):
             _assemble(front, next(leaves), *blocks)
         for c, runs in zip(front.children, front.runs, strict=True):
-            _add(left[c] if c in kept else memory.left[c], runs, front.pivots, *blocks)
-        memory.drop([c for c in front.children if c not in kept])
+            _add(memory.left[c], runs, front.pivots, *blocks)
+        memory.drop(front.children)
         rest = _eliminate(front, panels, *blocks)
-        if i in kept:
-            left[i] = rest.copy(order="F")
-            memory.drop([i])
-        else:
-            memory.left[i] = rest
+        memory.left[i] = rest
         del blocks, rest  # before the next front asks for room
         if progress is not None:
             progress(float(done))
 
 
-def room(tree: Tree, kind: np.dtype[Any], base: list[Array] | None = None) -> list[Array]:
-    """Zeros for the panels of each batch, (panels, rows, width), all of a piece; the base's if unchanging."""
+def room(tree: Tree, kind: np.dtype[Any]) -> list[Array]:
+    """Zeros for the panels of each batch, (panels, rows, width), all of a piece."""
     shapes = [(*batch.rows.shape, batch.width) for batch in tree.batches]
-    new = [base is None or batch.volatile for batch in tree.batches]
-    ends = np.cumsum([int(np.prod(shape)) * fresh for shape, fresh in zip(shapes, new, strict=True)])
-    whole = np.zeros(ends[-1], kind)
-    panels = []
-    for i, (shape, fresh) in enumerate(zip(shapes, new, strict=True)):
-        mine = whole[ends[i] - int(np.prod(shape)) : ends[i]] if fresh or base is None else base[i]
-        panels.append(mine.reshape(shape))
-    return panels
+    ends = np.cumsum([int(np.prod(shape)) for shape in shapes])
+    parts = np.split(np.zeros(ends[-1], kind), ends[:-1])
+    return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
 
 
 def _leaves(matrices: Array | Callable[[Ints], Array], leaves: list[Ints]) -> Iterator[Array]:
@@ -163,7 +145,7 @@ class _Memory:
     a front takes its room on one while its children are on top of the other.
     """
 
-    def __init__(self, tree: Tree, todo: list[int], kept: set[int], kind: np.dtype[Any]):
+    def __init__(self, tree: Tree, kind: np.dtype[Any]):
         self.tree = tree
         self.left: dict[int, Array] = {}
         depth = np.zeros(len(tree.fronts), dtype=np.int64)
@@ -172,12 +154,12 @@ class _Memory:
                 depth[c] = depth[i] + 1
         self.side = depth % 2
         self.top, most, panel = [0, 0], 0, 0
-        for i in todo:
-            p, f = tree.fronts[i].pivots, tree.fronts[i].size
+        for i, front in enumerate(tree.fronts):
+            p, f = front.pivots, front.size
             panel = max(panel, p * f if p * f <= _LARGE else 0)
             self.top[self.side[i]] += self._need(i)
             most = max(most, sum(self.top))
-            self.drop([c for c in tree.fronts[i].children if c not in kept] + [i] * (i in kept))
+            self.drop(front.children)
         self.stack: Array = np.empty(most, kind)
         self.panel: Array = np.empty(panel, kind)
 
@@ -202,7 +184,7 @@ class _Memory:
         a11, a21 = panel[: p * p], panel[p * p :]
         return a11.reshape(p, p, order="F"), a21.reshape(b, p, order="F"), rest.reshape(b, b, order="F")
 
-    def drop(self, fronts: list[int]) -> None:
+    def drop(self, fronts: tuple[int, ...]) -> None:
         """Give back the room of what fronts left, those on top of their stack first."""
         for i in fronts:
             self.top[self.side[i]] -= self._need(i)

@@ -149,9 +149,10 @@ class Body:
         """Factor of the tied stiffness for a set of closed pairs; an old one serves unless renewed."""
         key = sys.closed.tobytes()
         if renew or key not in self.factors:
-            self.factors.clear()
+            self.factors.clear()  # before the next one: the largest of all memory
             made = matrices if slope is None else matrices.sheared(sys.nodes.cells, slope)
-            self.factors[key] = Preconditioner(sys, solver.Factor(sys.tree, made), slope)
+            factor = solver.Factor(sys.tree, made)
+            self.factors[key] = Preconditioner(sys, factor if slope is None else factor.bare(), slope)
             self.effort.factors += 1
         return self.factors[key]
 
@@ -290,18 +291,7 @@ def _newton(body: Body, start: State, tolerance: float) -> State:
             return replace(start, moved=moved, force=-normal, chest=-forces[at_chest].sum(axis=0))
         if turn >= _PATIENCE and damping == 0 and size > 1e-2 * scale:
             raise NotConverged("Newton's method does not come down")
-        tangent = body.tangent(model, moved)
-        slopes = bond.slopes(len(moved)) if model.finite else None
-        while True:
-            matrices = tangent if damping == 0 else tangent.plus(damping, body.rest)
-            try:
-                factor = body.factor(sys, matrices, slopes, renew)
-                change, steps, downhill = _solve(body, model, sys, bond, matrices, factor, -residual)
-                break
-            except (Indefinite, np.linalg.LinAlgError):
-                if not model.finite or damping >= _STRONGEST:
-                    raise
-                damping, renew = max(4 * damping, _DAMPING), True
+        (change, steps, downhill), damping = _step(body, start, sys, moved, -residual, renew, damping)
         renew = model.finite and (steps > _WORTH or damping > 0)
         damping = damping / 4 if damping > _DAMPING else 0.0
         body.effort.newton += 1
@@ -320,18 +310,34 @@ def _newton(body: Body, start: State, tolerance: float) -> State:
     raise NotConverged("Newton's method does not converge")
 
 
+def _step(
+    body: Body, start: State, sys: System, moved: Floats, load: Floats, renew: bool, damping: float
+) -> tuple[tuple[Floats, int, float], float]:
+    """Newton's step as `_solve` gives it, with at least so much damping, and the damping it took."""
+    tangent = body.tangent(start.model, moved)
+    while True:
+        matrices = tangent if damping == 0 else tangent.plus(damping, body.rest)
+        try:
+            return _solve(body, start.model, sys, start.tie, matrices, load, renew), damping
+        except (Indefinite, np.linalg.LinAlgError):
+            if not start.model.finite or damping >= _STRONGEST:
+                raise
+            damping, renew = max(4 * damping, _DAMPING), True
+
+
 def _solve(
     body: Body,
     model: Model,
     sys: System,
     bond: Tie,
     matrices: Stiffness,
-    factor: Preconditioner,
     load: Floats,
+    renew: bool,
 ) -> tuple[Floats, int, float]:
     """Change of the displacements (nodes, 3) that a load on the unknowns makes, the iterations taken, and
     the work of the load."""
-    tip = model.nodes.tip
+    tip, slopes = model.nodes.tip, bond.slopes(len(model.place)) if model.finite else None
+    factor = body.factor(sys, matrices, slopes, renew)
 
     def expand(values: Floats) -> Floats:
         change = sys.expand(values)

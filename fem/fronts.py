@@ -42,8 +42,6 @@ class Front:
     runs
         Of each child: rows of its border that stay together as (from, to, length), rising; `to` counts in
         this front.
-    volatile
-        Whether it depends on the elements kept for last.
     panels
         Where its part of the factor is stored: (batch, slot, first pivot, end).
     """
@@ -55,7 +53,6 @@ class Front:
     place: Ints
     children: tuple[int, ...]
     runs: tuple[tuple[tuple[int, int, int], ...], ...]
-    volatile: bool
     panels: tuple[tuple[int, int, int, int], ...]
 
     @property
@@ -74,13 +71,10 @@ class Batch:
         (panels, width + rows below).
     width
         Pivots, with filling.
-    volatile
-        As of the fronts.
     """
 
     rows: Ints
     width: int
-    volatile: bool
 
 
 @dataclass(frozen=True)
@@ -97,7 +91,7 @@ class Tree:
         return len(self.order)
 
 
-def plan(dofs: Ints, centres: Floats, last: Bools, like: Tree | None = None) -> Tree:
+def plan(dofs: Ints, centres: Floats, like: Tree | None = None) -> Tree:
     """Find the order of elimination; depends on the topology only.
 
     Parameters
@@ -106,17 +100,15 @@ def plan(dofs: Ints, centres: Floats, last: Bools, like: Tree | None = None) -> 
         Unknown of each local dof, 0 ... n - 1, or -1 where it is prescribed; shape (elements, k).
     centres
         Positions that tell which elements lie together; shape (elements, 3).
-    last
-        True for the elements whose stiffness will change: their unknowns come last; shape (elements,).
     like
         A tree of the same elements whose dissection is taken over, which saves most of the time; good where
         few unknowns differ.
     """
     mesh = groups_of(dofs, centres)
     if like is None:
-        return _number(mesh, dofs, last, dissect(mesh, last))
+        return _number(mesh, dofs, dissect(mesh))
     elements, children = [f.elements for f in like.fronts], [f.children for f in like.fronts]
-    return _number(mesh, dofs, last, Dissection(elements, children, *eliminate(mesh, elements, children)))
+    return _number(mesh, dofs, Dissection(elements, children, *eliminate(mesh, elements, children)))
 
 
 def _spread(starts: Ints, lengths: Ints) -> Ints:
@@ -125,7 +117,7 @@ def _spread(starts: Ints, lengths: Ints) -> Ints:
     return np.repeat(starts - before, lengths) + np.arange(int(lengths.sum()))
 
 
-def _number(mesh: Groups, dofs: Ints, last: Bools, found: Dissection) -> Tree:
+def _number(mesh: Groups, dofs: Ints, found: Dissection) -> Tree:
     """Give the unknowns their numbers, and the fronts their rows."""
     leaves, children, borders = found.elements, found.children, found.borders
     weight, groups, size = mesh.weight, len(mesh.weight) - 1, len(mesh.members)
@@ -165,8 +157,7 @@ def _number(mesh: Groups, dofs: Ints, last: Bools, found: Dissection) -> Tree:
         for c in under:
             handed = borders[c][np.argsort(begin[borders[c]])]
             runs.append(_runs(at[handed], weight[handed], p))
-        changing = bool(last[elements].any()) or any(fronts[c].volatile for c in under)
-        fronts.append(Front(start, p, border, elements, place, under, tuple(runs), changing, ()))
+        fronts.append(Front(start, p, border, elements, place, under, tuple(runs), ()))
     return _batched(fronts, order, dofs)
 
 
@@ -199,25 +190,24 @@ def _batched(fronts: list[Front], order: Ints, dofs: Ints) -> Tree:
             rows[slot, : front.pivots] = front.start + np.arange(front.pivots)
             rows[slot, width : width + len(front.border)] = front.border
             panels[i] = ((len(batches), slot, 0, front.pivots),)
-        batches.append(Batch(rows, width, fronts[chosen[0]].volatile))
+        batches.append(Batch(rows, width))
 
     for level in range(int(height.max()) + 1):
         here = [int(i) for i in np.flatnonzero(height == level) if fronts[i].pivots]
-        for volatile in (False, True):
-            small = [i for i in here if fronts[i].pivots <= _PANEL and fronts[i].volatile == volatile]
-            small.sort(key=lambda i: (fronts[i].pivots, fronts[i].size, i))
-            chosen: list[int] = []
-            used = below = 0
-            for i in small:
-                p, b = fronts[i].pivots, len(fronts[i].border)
-                below = max(below, b)
-                if chosen and (len(chosen) + 1) * p * (p + below) > _PADDING * (used + p * (p + b)):
-                    add(chosen)
-                    chosen, used, below = [], 0, b
-                chosen.append(i)
-                used += p * (p + b)
-            if chosen:
+        small = [i for i in here if fronts[i].pivots <= _PANEL]
+        small.sort(key=lambda i: (fronts[i].pivots, fronts[i].size, i))
+        chosen: list[int] = []
+        used = below = 0
+        for i in small:
+            p, b = fronts[i].pivots, len(fronts[i].border)
+            below = max(below, b)
+            if chosen and (len(chosen) + 1) * p * (p + below) > _PADDING * (used + p * (p + b)):
                 add(chosen)
+                chosen, used, below = [], 0, b
+            chosen.append(i)
+            used += p * (p + b)
+        if chosen:
+            add(chosen)
         for i in here:
             front = fronts[i]
             if front.pivots > _PANEL:
@@ -227,9 +217,7 @@ def _batched(fronts: list[Front], order: Ints, dofs: Ints) -> Tree:
                 for low, high in pairwise(ends):
                     inner = front.start + np.arange(low, front.pivots)
                     found.append((len(batches), 0, int(low), int(high)))
-                    batches.append(
-                        Batch(np.concatenate([inner, front.border])[None], int(high - low), front.volatile)
-                    )
+                    batches.append(Batch(np.concatenate([inner, front.border])[None], int(high - low)))
                 panels[i] = tuple(found)
     placed = tuple(replace(front, panels=panels.get(i, ())) for i, front in enumerate(fronts))
     return Tree(placed, tuple(batches), order, dofs)

@@ -16,7 +16,7 @@ from fem.meshed import Model, moduli
 
 Floats = NDArray[np.float64]
 
-_LONGEST = 1.0  # mm of indentation in one step
+_LONGEST = 1.0  # mm of indentation in one step at finite strain
 _SECANT, _FORCE = 25, 1e-6  # steps to find a force, and how well to meet it
 _CUTS = 9  # halvings of a step at most
 
@@ -51,7 +51,8 @@ class Path:
                 pass  # go all the way on its own feet
         near = min(self.states, key=lambda s: abs(s.indentation - indentation))
         shortest = max(abs(indentation - near.indentation), 1e-3) / 2**_CUTS
-        step = float(np.clip(indentation - near.indentation, -_LONGEST, _LONGEST))
+        longest = _LONGEST if near.model.finite else np.inf  # small strain does not depend on its way
+        step = float(np.clip(indentation - near.indentation, -longest, longest))
         while near.indentation != indentation:
             left = indentation - near.indentation
             target = indentation if abs(step) >= abs(left) * (1 - 1e-9) else near.indentation + step

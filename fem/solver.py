@@ -4,11 +4,10 @@
 `fem.elimination` does the sums. Element matrices go straight into dense fronts, no global matrix is ever
 assembled. LAPACK does the work, so nothing but SciPy is needed.
 
-Three habits make this the right solver here. A set of elements may be kept for the very top of the tree (the
-inclusion): nothing below depends on their stiffness, so it is factored once for all moduli. The fronts are in
-single precision, which halves time and memory, and conjugate gradients make up for the digits. And the order
-of every sum is fixed by the tree, with single-threaded BLAS inside, so the bytes do not depend on the number
-of threads.
+Three habits make this the right solver here. The fronts are in single precision, which halves time and
+memory, and conjugate gradients make up for the digits. They also let one factor serve other matrices, such as
+those of another inclusion. And the order of every sum is fixed by the tree, with single-threaded BLAS inside,
+so the bytes do not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -57,9 +56,6 @@ class Factor:
     matrices
         Symmetric element matrices, shape (elements, k, k), of single or double precision; or a function that
         makes them for the elements asked for (n,), so that they never exist all at once.
-    base
-        A factor of the same tree whose matrices differ only in the elements kept for last: all the rest is
-        shared.
     progress
         Called with the fraction done.
     precision
@@ -81,31 +77,33 @@ class Factor:
         self,
         tree: Tree,
         matrices: Matrices,
-        base: Factor | None = None,
         progress: Callable[[float], None] | None = None,
         precision: Precision = "single",
     ):
         self.tree = tree
         self.matrices: Any = matrices
-        self.precision: Precision = precision if base is None else base.precision
+        self.precision: Precision = precision
         broken = False
         try:
-            self._factorise(base, progress)
+            self._factorise(progress)
         except np.linalg.LinAlgError:
             if self.precision == "double":
                 raise
             broken = True
         if broken:
             self.precision = "double"
-            self._factorise(None, progress)
+            self._factorise(progress)
 
-    def _factorise(self, base: Factor | None, progress: Callable[[float], None] | None) -> None:
-        self._panels: list[Array] = room(
-            self.tree, _KIND[self.precision], None if base is None else base._panels
-        )
-        self._left: dict[int, Array] = {} if base is None else base._left
+    def _factorise(self, progress: Callable[[float], None] | None) -> None:
+        self._panels: list[Array] = []  # lets go of those of another precision
+        self._panels = room(self.tree, _KIND[self.precision])
         with one_thread():
-            factorise(self.tree, self.matrices, self._panels, self._left, base is not None, progress)
+            factorise(self.tree, self.matrices, self._panels, progress)
+
+    def bare(self) -> Factor:
+        """Let go of the matrices, for one that is to `precondition` only."""
+        self.matrices = None
+        return self
 
     def solve(self, load: Floats, tolerance: float = 1e-13, matrices: Matrices | None = None) -> Floats:
         """Unknowns for a load, both shape (unknowns,), to a residual of `tolerance` times the load.
@@ -125,7 +123,7 @@ class Factor:
                 return Factor(self.tree, matrices, precision=self.precision).solve(load, tolerance)
             if x is None:
                 self.precision = "double"
-                self._factorise(None, None)
+                self._factorise(None)
                 x = self._iterate(load, tolerance, self.matrices)
             if x is None:
                 raise np.linalg.LinAlgError("stiffness is too close to singular to solve with")

@@ -55,7 +55,7 @@ def follow(stage: Stage, lit: Array, samples: int, seed: int) -> Landed:
     lit
         `Response.upward` of the gathered light on those cells, (1 + q, n_led, modes, m, m).
     samples, seed
-        As of `transport.transport`; the light itself is the same to the last bits.
+        As of `transport.transport`; the light itself is the same but for rounding.
     """
     response, n_led = stage.response, len(stage.sensor.leds)
     starts = np.random.Generator(np.random.Philox(seed)).integers(0, 2**32, size=(transport.ORDERS + 1, 4))

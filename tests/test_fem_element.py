@@ -41,7 +41,7 @@ def dirichlet(mesh: MeshHex2, modulus: float, poisson: float, exact: Floats, loa
     force = (matrices @ full[local][:, :, None])[:, :, 0]
     rest = load - np.bincount(local.ravel(), weights=force.ravel(), minlength=len(full))
     centres = mesh.p[:, mesh.t].mean(axis=1).T
-    tree = solver.plan(number[local], centres, np.zeros(n, dtype=bool))
+    tree = solver.plan(number[local], centres)
     full[~held] = solver.Factor(tree, matrices).solve(rest[~held])
     return full.reshape(-1, 3).T
 

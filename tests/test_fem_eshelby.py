@@ -91,7 +91,7 @@ def relative_error(
     full = np.where(fixed, exact.T.ravel(), 0.0)
     force = (matrices @ full[local][:, :, None])[:, :, 0]
     load = -np.bincount(local.ravel(), weights=force.ravel(), minlength=len(full))[~fixed]
-    tree = solver.plan(number[local], block.p[:, block.t].mean(axis=1).T, inside)
+    tree = solver.plan(number[local], block.p[:, block.t].mean(axis=1).T)
     full[~fixed] = solver.Factor(tree, matrices).solve(load)
 
     within = np.flatnonzero(inside)

@@ -114,7 +114,7 @@ def profile(picture: np.ndarray) -> np.ndarray:
     return np.asarray(line.reshape(*line.shape[:-1], 12, 4).mean(axis=-1))
 
 
-@pytest.mark.parametrize("name", ["air", "embedded, full contact"])
+@pytest.mark.parametrize("name", ["air", pytest.param("embedded, full contact", marks=pytest.mark.slow)])
 def test_all_light_and_that_of_the_rim_are_the_references(variant: str, name: str) -> None:
     """All of it within 0.5 %, and within 4 % what is seen of the outermost millimetre, where light goes over
     the rim."""
