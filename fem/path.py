@@ -19,6 +19,7 @@ Floats = NDArray[np.float64]
 _LONGEST = 1.0  # mm of indentation in one step at finite strain
 _SECANT, _FORCE = 25, 1e-6  # steps to find a force, and how well to meet it
 _CUTS = 9  # halvings of a step at most
+_GROWTH = 1.5  # of a step after one that held
 
 
 @dataclass
@@ -30,8 +31,7 @@ class Path:
     states: list[State]
     beside: Path | None = None
     """The same press without inclusion: its states are where to begin, and give the mesh."""
-    linear: Path | None = None
-    """The same press in small strain."""
+    _linear: Path | None = None
     _rate: Floats | None = None
 
     def to(self, indentation: float) -> State:
@@ -67,6 +67,7 @@ class Path:
                     ) from None
                 continue
             self.states.append(near)
+            step = float(np.clip(_GROWTH * step, -longest, longest))
         return near
 
     def _ahead(self, near: State, indentation: float) -> State:
@@ -76,12 +77,11 @@ class Path:
             way = indentation - near.indentation
             moved = near.moved + self.rate() * way
             shift = near.model.wanted(moved)
-        elif len(known) == 1 and near.model.finite:  # nothing touches yet: begin where small strain ends
-            if self.linear is None:
-                small = replace(near.model, finite=False)
-                self.linear = path(self.geometry, small, self.body.stiff)
-            begun = self.linear.to(indentation)
-            return replace(begun, model=near.model)
+        elif near.model.finite and not all(s.closed.all() for s in known):  # it spreads as at small strain
+            here, there = (self.small().to(each) for each in (near.indentation, indentation))
+            moved, closed = near.moved + there.moved - here.moved, near.closed | there.closed
+            shift = near.model.wanted(moved) if near.closed.any() else near.model.shift
+            near = replace(near, closed=closed)
         elif len(known) == 1:  # the slab comes nearer as a whole
             moved = near.moved - (indentation - near.indentation) * near.model.normal * near.model.slab
             shift = near.model.shift
@@ -155,6 +155,10 @@ class Path:
             rates = [p.rate() for p in (self, self.beside)]
             difference = (rates[0] - rates[1]) * other.indentation
             slip = other.model.interface.slip(difference)
+        elif other.model.finite:
+            own, theirs = (p.small().to(other.indentation) for p in (self, self.beside))
+            difference = own.moved - theirs.moved
+            slip = other.model.interface.slip(difference)
         else:
             difference, slip = np.zeros_like(other.moved), np.zeros_like(other.model.shift)
         guess = replace(other, moved=other.moved + difference)
@@ -163,6 +167,14 @@ class Path:
             if other.model.finite
             else guess
         )
+
+    def small(self) -> Path:
+        """The same press in small strain."""
+        if self._linear is None:
+            model = replace(self.states[0].model, finite=False)
+            beside = None if self.beside is None else self.beside.small()
+            self._linear = path(self.geometry, model, self.body.stiff, beside)
+        return self._linear
 
     def rate(self) -> Floats:
         """Displacements per mm of a linear press with all pairs closed, (nodes, 3) mm / mm."""

@@ -61,6 +61,8 @@ class Factor:
     precision
         Of the fronts. "single" takes half the time and memory, and `solve` makes up for the digits by
         conjugate gradients; a matrix that is not positive definite in single precision is factored in double.
+    again
+        False: such a matrix is an error.
 
     Attributes
     ----------
@@ -70,7 +72,7 @@ class Factor:
     Raises
     ------
     LinAlgError
-        If the matrix is not positive definite in double precision.
+        If the matrix is not positive definite in double precision, or not in the one asked for.
     """
 
     def __init__(
@@ -79,6 +81,7 @@ class Factor:
         matrices: Matrices,
         progress: Callable[[float], None] | None = None,
         precision: Precision = "single",
+        again: bool = True,
     ):
         self.tree = tree
         self.matrices: Any = matrices
@@ -87,7 +90,7 @@ class Factor:
         try:
             self._factorise(progress)
         except np.linalg.LinAlgError:
-            if self.precision == "double":
+            if self.precision == "double" or not again:
                 raise
             broken = True
         if broken:
