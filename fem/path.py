@@ -110,7 +110,12 @@ class Path:
             return float(state.force.sum()) - force
 
         known = [s for s in self.states if s is not first]
-        state = min(known, key=lambda s: abs(error(s))) if known else self.to(first.indentation + 0.5)
+        if known:
+            state = min(known, key=lambda s: abs(error(s)))
+        elif first.model.finite:
+            state = self.to(self.small().by_force(force).indentation)
+        else:
+            state = self.to(first.indentation + 0.5)
         before = first
         for _ in range(_SECANT):
             if abs(error(state)) <= _FORCE * force:
@@ -177,7 +182,10 @@ class Path:
         return self._linear
 
     def rate(self) -> Floats:
-        """Displacements per mm of a linear press with all pairs closed, (nodes, 3) mm / mm."""
+        """Displacements per mm of a linear press with all pairs closed, (nodes, 3) mm / mm.
+
+        Cheap as long as the factor is that of the bodies at rest: ask before a finite press begins.
+        """
         if self._rate is None:
             model = self.states[0].model
             sys = model.system(np.ones(model.nodes.tip.shape, dtype=bool))

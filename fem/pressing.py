@@ -308,8 +308,11 @@ def _presses(
             model = build(first, res, mechanics == "finite")
             bare = path(first, model, False)
             step("without inclusion")
-            for geometry in geometries:
-                full = bare if geometry.inclusion is None else path(geometry, model, True, bare)
+            paths = [bare if g.inclusion is None else path(g, model, True, bare) for g in geometries]
+            if estimate or bare.states[0].closed.all():
+                for one in (bare, *paths):
+                    one.rate()
+            for geometry, full in zip(geometries, paths, strict=True):
                 error = discretisation_error(geometry, res, full, bare) if estimate else np.nan
                 step("error estimate")
                 found: dict[float, Press] = {}
