@@ -97,7 +97,9 @@ def test_linear(tmp_path: Path, inclusion: fem.Inclusion) -> None:
         pytest.param(
             6.0,
             marks=pytest.mark.xfail(
-                raises=fem.NotConverged, strict=True, reason="the probe's soft corners fold before 6 mm"
+                raises=fem.NotConverged,
+                strict=True,
+                reason="the corner gives way: test_fem_corner.py",
             ),
         ),
     ],
