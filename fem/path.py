@@ -18,7 +18,7 @@ Floats = NDArray[np.float64]
 
 _LONGEST = 1.0  # mm of indentation in one step at finite strain
 _SECANT, _FORCE = 25, 1e-6  # steps to find a force, and how well to meet it
-_CUTS = 9  # halvings of a step at most
+_CUTS = 6  # halvings of a step at most
 _GROWTH = 1.5  # of a step after one that held
 
 

@@ -9,7 +9,7 @@ from scipy.sparse.linalg import LinearOperator, lobpcg
 
 import fem
 from fem import mesh, solver
-from fem.equilibrium import Body, Preconditioner, State, Stiffness, product
+from fem.equilibrium import Body, NotConverged, Preconditioner, State, Stiffness, product
 from fem.mesh import Geometry
 from fem.meshed import build
 from fem.path import path
@@ -60,12 +60,10 @@ def softest(body: Body, state: State) -> tuple[float, float]:
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 @pytest.mark.filterwarnings("ignore:Exited")
-@pytest.mark.parametrize(
-    "quality, levels, beyond", [("preview", range(1, 7), 8.0), ("standard", range(1, 5), 6.0)]
-)
-def test_a_sharp_corner_loses_its_stiffness(quality: str, levels: range, beyond: float) -> None:
-    """The smallest eigenvalue of the tangent over the stiffness at rest falls to nothing, the sooner
-    the finer the mesh, in a mode that lives at the corner; beyond, no equilibrium is found."""
+@pytest.mark.parametrize("quality, levels", [("preview", range(1, 7)), ("standard", range(1, 5))])
+def test_a_sharp_corner_loses_its_stiffness(quality: str, levels: range) -> None:
+    """The smallest eigenvalue of the tangent over the stiffness at rest falls to nothing, sooner the finer
+    the mesh, in a mode that lives at the corner; at standard quality no equilibrium is found at 6 mm."""
     geometry = Geometry(PROBE, SLAB, fem.Inclusion(10, 5, 100))
     with solver.one_thread():
         bare = path(geometry, build(geometry, mesh.QUALITIES[quality], True), False)
@@ -77,5 +75,6 @@ def test_a_sharp_corner_loses_its_stiffness(quality: str, levels: range, beyond:
         stiffness = np.array([one for one, _ in found])
         assert (np.diff(stiffness) < 0).all() and stiffness[-1] < 0.1 * stiffness[0]
         assert found[-1][1] > 0.7
-        with pytest.raises(ArithmeticError):
-            bare.to(beyond)
+        if quality == "standard":
+            with pytest.raises(NotConverged):
+                bare.to(6.0)
