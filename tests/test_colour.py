@@ -64,6 +64,7 @@ def test_counts_are_those_of_the_photons(colour: twin.Frame) -> None:
     assert camera.bits == 12
 
 
+@pytest.mark.slow
 def test_white_frames_averaged_and_binned(tmp_path) -> None:
     """Their mean keeps fractions of counts, in image.exr; noise falls as the root of their number."""
     frames = [

@@ -53,6 +53,7 @@ class Noisy(Follower):
         return lit.layers[int(plain)], slopes * blotches
 
 
+@pytest.mark.slow
 def test_without_noise_both_lights_are_one() -> None:
     one = follower(Noisy)
     for _ in range(4):

@@ -113,6 +113,7 @@ def test_the_reference_knows_nothing_of_the_inclusion(bench: Any) -> None:
     assert not found.jacobian[:2, 1].any() and found.jacobian[:2, 0].any()
 
 
+@pytest.mark.slow
 def test_more_of_everything_never_hurts(bench: Any) -> None:
     """Frames, levels, light below saturation, and unknowns that become known lower every bound."""
     one = sd(bench(layout()))

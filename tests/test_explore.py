@@ -228,7 +228,7 @@ def test_two_processes_share_one_study(tmp_path: Path) -> None:
     shared(prepared(tmp_path))
 
 
-@pytest.mark.parametrize("method", ["nsga2", "tpe"])
+@pytest.mark.parametrize("method", [pytest.param("nsga2", marks=pytest.mark.slow), "tpe"])
 def test_no_layout_is_tried_twice(tmp_path: Path, method: str) -> None:
     """Up to 3 LEDs in 2 arrangements: one LED makes one sensor twice, so 5 are tried before any repeats."""
     text = STUDY.replace("METHOD", method).replace("trials = 12", "trials = 5").replace("[1, 8]", "[1, 3]")

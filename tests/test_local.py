@@ -10,7 +10,8 @@ from sensors import bump, dense, paper_sensor
 COARSE = {"columns": 24, "rows": 16, "pixel_um": (268.8, 301.35)}
 
 
-@pytest.mark.parametrize("coupling", ["air", pytest.param("embedded", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("coupling", ["air", "embedded"])
 def test_gathered_light_is_what_rays_count_in_the_same_pixels(variant: str, coupling: str) -> None:
     """All of it within 0.5 %; each pixel within its noise, and that falls."""
     from scenes import Renderer, exact, local, surface, transport

@@ -42,6 +42,7 @@ def near(step=0.02):
     return middle, high, scored.Slope(*slopes, step)
 
 
+@pytest.mark.slow
 def test_scores_are_what_finite_differences_find(renderer):
     """Contact fraction all over, and of one half: the same paths, chosen anew at contacts a fifth off."""
     import drjit as dr

@@ -111,13 +111,13 @@ def expected(
         For unknowns that the design does not have, and specimens that the emulator does not know.
     """
     stage = _Stage(design, inclusion, tuple(levels), emulator, quality, light_seed(seed))
+    values = [stage.value(unknown.name) for unknown in unknowns]  # complaints come before any light
+    steps = [step_of(unknown, value) for unknown, value in zip(unknowns, values, strict=True)]
     middle = stage.pictures((), None)
     if again:  # the middle, too, as the pictures beside it are made
         middle = replace(middle, mean=stage.pictures((), middle).mean)
     slopes = []
-    for number, unknown in enumerate(unknowns):
-        value = stage.value(unknown.name)
-        step = step_of(unknown, value)
+    for number, (unknown, value, step) in enumerate(zip(unknowns, values, steps, strict=True)):
         ends = (value - step, value + step)
         if unknown.relative:
             ends = (value * np.exp(-step), value * np.exp(step))
