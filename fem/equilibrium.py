@@ -151,7 +151,7 @@ class Body:
         if renew or key not in self.factors:
             self.factors.clear()  # before the next one: the largest of all memory
             made = matrices if slope is None else matrices.sheared(sys.nodes.cells, slope)
-            # a tangent that single precision calls indefinite is so: not worth a factor in double
+            # a tangent that is not definite in single precision is damped, rather than factored in double
             factor = solver.Factor(sys.tree, made, again=slope is None)
             self.factors[key] = Preconditioner(sys, factor if slope is None else factor.bare(), slope)
             self.effort.factors += 1
