@@ -1,6 +1,8 @@
 """What a frame leaves on disk: every file, whole or not at all, and the same bytes for the same seed."""
 
+import gc
 import hashlib
+import itertools
 import json
 import os
 import signal
@@ -17,10 +19,12 @@ from test_simulate import INCLUSION, small
 
 import twin
 import twin.cli
+import twin.stage
 from scenes.exr import read_exr, read_exr_header, read_png
 from twin.frame import FILES, holds_frames, write_frames
 from twin.interrupt import guarded
 from twin.reporting import summarise
+from twin.stage import staged, staged_file
 
 FRAME_KEYS = {"inclusion", "press", "lens", "fem", "tsis", "design", "seed", "versions", "sha256"}
 RUN = ["simulate", "--size", "10", "--depth", "5", "--modulus", "100", "--out", "out"]
@@ -205,6 +209,72 @@ def test_folders_of_killed_runs_go_with_the_next_run(frame, tmp_path, plain_shee
         (place / "00").mkdir(parents=True)
     out = frame.write(tmp_path / "out")
     assert set(tmp_path.iterdir()) == {out, *others}
+
+
+def test_an_earlier_result_that_a_killed_run_had_moved_aside_comes_back(frame, tmp_path, plain_sheet):
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    earlier = frame.write(tmp_path / "out").rename(tmp_path / f".out.{gone.pid}.old")
+    before = {path.name: path.read_bytes() for path in earlier.iterdir()}
+    with pytest.raises(DiskFull), staged(tmp_path / "out", holds_frames):
+        fill_the_disk()
+    assert list(tmp_path.iterdir()) == [tmp_path / "out"]
+    assert {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()} == before
+
+
+def write_staged(place):
+    with staged(place, lambda folder: True) as folder:
+        (folder / "new").write_text("whole")
+
+
+def write_staged_file(place):
+    with staged_file(f"{place}.txt", "out", ".txt") as path:
+        path.write_text("whole")
+
+
+@pytest.mark.parametrize(
+    ("write", "earlier"), [(write_staged, False), (write_staged, True), (write_staged_file, False)]
+)
+def test_an_interrupt_between_any_two_lines_leaves_all_or_nothing(write, earlier, tmp_path):
+    """Raises at the first line that `twin.stage` runs, then at the second, and so on to its last."""
+    countdown = 0
+
+    def trace(code_frame, event, argument):
+        nonlocal countdown
+        if code_frame.f_code.co_filename != twin.stage.__file__:
+            return None
+        if event == "line":
+            countdown -= 1
+            if countdown == 0:
+                raise KeyboardInterrupt
+        return trace
+
+    raised = 0
+    for line in itertools.count(1):
+        place = tmp_path / str(line) / "above" / "out"
+        if earlier:
+            place.mkdir(parents=True)
+            (place / "old").write_text("whole")
+        else:
+            place.parent.parent.mkdir()
+        countdown = line
+        kept = sys.gettrace()
+        sys.settrace(trace)
+        try:
+            write(place)
+        except KeyboardInterrupt:
+            raised += 1
+        finally:
+            sys.settrace(kept)
+        gc.collect()  # a generator that was never entered ends here
+        if countdown > 0:  # no line was left to raise at
+            break
+        found = {path.name: path.read_text() for path in place.parent.parent.rglob("*") if path.is_file()}
+        whole = [{"old": "whole"}] if earlier else [{}]
+        assert found in [*whole, {"new": "whole"}, {"out.txt": "whole"}], line
+        folders = {path.name for path in place.parent.parent.rglob("*") if path.is_dir()}
+        assert folders <= {"above", "out"} if found else not folders, line
+    assert raised > 15
 
 
 def test_headers_name_the_units(folder):

@@ -10,7 +10,7 @@ import glob
 import os
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from twin.complaint import DesignError, shown
@@ -28,22 +28,9 @@ def staged(out: str | Path, is_ours: Callable[[Path], bool]) -> Iterator[Path]:
         raise DesignError("out", "an empty name", "the folder to make for the results")
     target = Path(os.path.abspath(out))
     _refuse_foreign(out, target, is_ours)
-    made: list[Path] = []
-    try:
-        made = _make_parents(target.parent)
-        _remove_abandoned(target)
-        folder = target.with_name(f".{target.name}.{os.getpid()}.part")
-        folder.mkdir()
-    except (OSError, ValueError) as error:
-        _remove_empty(made)
-        raise DesignError("out", shown(str(out)), f"a folder that can be made ({_reason(error)})") from None
-    try:
+    with _making(target, "out", str(out), "a folder that can be made") as folder:
         yield folder
         _swap(folder, target)
-    except BaseException:
-        shutil.rmtree(folder, ignore_errors=True)
-        _remove_empty(made)
-        raise
 
 
 @contextmanager
@@ -54,23 +41,33 @@ def staged_file(name: str, field: str, suffix: str) -> Iterator[Path]:
     folder, or a place that cannot be written, is refused with a `DesignError` about ``field``.
     """
     target = check_file(name, field, suffix)
-    made: list[Path] = []
-    try:
-        made = _make_parents(target.parent)
-        _remove_abandoned(target)
-        folder = target.with_name(f".{target.name}.{os.getpid()}.part")
-        folder.mkdir()
-    except (OSError, ValueError) as error:
-        _remove_empty(made)
-        raise DesignError(field, shown(name), f"a file that can be made ({_reason(error)})") from None
-    try:
+    with _making(target, field, name, "a file that can be made") as folder:
         yield folder / target.name
         os.replace(folder / target.name, target)
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def _making(target: Path, field: str, name: str, allowed: str) -> Iterator[Path]:
+    """Yield an empty folder beside the target; if the block fails, it vanishes with the parents it needed.
+
+    A signal may come between any two steps, so everything that makes something is inside the same `try`.
+    """
+    folder = target.with_name(f".{target.name}.{os.getpid()}.part")
+    made: list[Path] = []
+    try:
+        try:
+            _make_parents(target.parent, made)
+            _remove_abandoned(target)
+            folder.mkdir()
+        except (OSError, ValueError) as error:
+            raise DesignError(field, shown(name), f"{allowed} ({_reason(error)})") from None
+        yield folder
     except BaseException:
+        _settle(folder.with_suffix(".old"), target)
         shutil.rmtree(folder, ignore_errors=True)
         _remove_empty(made)
         raise
-    shutil.rmtree(folder, ignore_errors=True)
 
 
 def check_file(name: str, field: str, suffix: str) -> Path:
@@ -100,10 +97,19 @@ def _refuse_foreign(out: str | Path, target: Path, is_ours: Callable[[Path], boo
 
 
 def _remove_abandoned(target: Path) -> None:
-    """Remove what earlier runs towards the same folder left when they were killed outright."""
-    for place in target.parent.glob(f".{glob.escape(target.name)}.*.part"):
-        pid = place.name.removeprefix(f".{target.name}.").removesuffix(".part")
-        if pid.isdecimal() and place.is_dir() and not place.is_symlink() and not _lives(int(pid)):
+    """Remove what earlier runs towards the same folder left when they were killed outright.
+
+    An earlier result that such a run had moved aside takes its place again where nothing new stands there.
+    """
+    for place in target.parent.glob(f".{glob.escape(target.name)}.*"):
+        pid, _, kind = place.name.removeprefix(f".{target.name}.").partition(".")
+        if kind not in ("part", "old") or not pid.isdecimal() or _lives(int(pid)):
+            continue
+        if place.is_symlink() or not place.is_dir():
+            continue
+        if kind == "old":
+            _settle(place, target)
+        else:
             shutil.rmtree(place, ignore_errors=True)
 
 
@@ -119,41 +125,37 @@ def _lives(pid: int) -> bool:
     return True
 
 
-def _make_parents(parent: Path) -> list[Path]:
-    """Make a folder and those above it; return the new ones, the outermost first."""
+def _make_parents(parent: Path, made: list[Path]) -> None:
+    """Make a folder and those above it, and add the new ones to ``made``, the outermost first."""
     missing = [place for place in (parent, *parent.parents) if not place.exists()]
-    made: list[Path] = []
-    try:
-        for place in reversed(missing):
-            place.mkdir()
-            made.append(place)
-    except OSError:
-        _remove_empty(made)
-        raise
-    return made
+    for place in reversed(missing):
+        made.append(place)  # first, for a signal may come once it is there
+        place.mkdir()
 
 
 def _remove_empty(made: list[Path]) -> None:
     for place in reversed(made):
-        try:
+        with suppress(OSError):  # never made, or somebody else uses it by now
             place.rmdir()
-        except OSError:  # somebody else uses it by now
-            return
 
 
 def _swap(folder: Path, target: Path) -> None:
     """Put the folder in the target's place; the earlier one goes only once the new one stands."""
-    if not target.exists():
-        folder.rename(target)
-        return
     earlier = folder.with_suffix(".old")
-    target.rename(earlier)
-    try:
-        folder.rename(target)
-    except BaseException:
+    if target.exists():
+        target.rename(earlier)
+    folder.rename(target)
+    _settle(earlier, target)
+
+
+def _settle(earlier: Path, target: Path) -> None:
+    """Remove the result that was moved aside, or put it back where no new one stands."""
+    if not earlier.exists():
+        return
+    if target.exists():
+        shutil.rmtree(earlier, ignore_errors=True)
+    else:
         earlier.rename(target)
-        raise
-    shutil.rmtree(earlier, ignore_errors=True)
 
 
 def _reason(error: OSError | ValueError) -> str:

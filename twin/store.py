@@ -83,9 +83,9 @@ def sample_in_making(corpus: Path, number: int) -> Iterator[Path]:
     place = sample_folder(corpus, number)
     place.parent.mkdir(parents=True, exist_ok=True)
     making = place.with_name(f".{place.name}.{os.getpid()}.part")
-    shutil.rmtree(making, ignore_errors=True)
-    making.mkdir()
     try:
+        shutil.rmtree(making, ignore_errors=True)
+        making.mkdir()
         yield making
         _flush(making)
         try:
