@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from .arrays import floats
 from .bsdf import Table
 
 Array = NDArray[np.float64]
@@ -40,7 +41,7 @@ class Answers:
         guide's face, and those of the table of T, (n_fraction, n_cos) each, or None."""
         maps = np.ascontiguousarray(np.moveaxis(slopes, 0, -1), dtype=np.float32)
         texture = mi.Texture2f(mi.TensorXf(maps), wrap_mode=dr.WrapMode.Clamp)
-        flat = (None if one is None else mi.Float(one.astype(np.float32).ravel()) for one in tables)
+        flat = (None if one is None else floats(one) for one in tables)
         return Answers(texture, tuple(flat), width_mm)
 
     def mirrored(

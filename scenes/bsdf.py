@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .arrays import floats
 from .contact import ContactOptics
 from .tissue import Coupling
 
@@ -28,14 +29,14 @@ class Table:
         self.modes = int(values[-1, -1])
         self.rows, self.columns = values.shape[0] - self.modes, values.shape[1] - 1 - self.modes**2
         top = values[: self.rows]
-        self._t = mi.Float(np.ascontiguousarray(top[:, : self.columns]).ravel())
-        self._mean = mi.Float(top[:, self.columns].copy())
-        self._gain = [mi.Float(column.copy()) for column in top[:, self.columns + 1 :].T]
-        self._lobes = [mi.Float(row[: self.columns].copy()) for row in values[self.rows :]]
+        self._t = floats(top[:, : self.columns])
+        self._mean = floats(top[:, self.columns])
+        self._gain = [floats(column) for column in top[:, self.columns + 1 :].T]
+        self._lobes = [floats(row[: self.columns]) for row in values[self.rows :]]
         binned, summed = _binned(top[:, : self.columns].astype(np.float64))
-        self._binned = mi.Float(binned.astype(np.float32).ravel())
-        self._summed = mi.Float(summed.astype(np.float32).ravel())
-        self._all = mi.Float(summed[:, -1].astype(np.float32))
+        self._binned = floats(binned)
+        self._summed = floats(summed)
+        self._all = floats(summed[:, -1])
 
     @staticmethod
     def pack(optics: ContactOptics, coupling: Coupling | None = None) -> mi.TensorXf:

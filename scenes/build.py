@@ -17,6 +17,7 @@ from . import (
     pinhole,
     surface,
 )
+from .arrays import floats, numbers
 from .contact import ContactOptics, contact_optics, real_contact
 from .sensor import Led, NotModelled, Sensor
 from .tissue import Coupling, body_behind, couple
@@ -170,7 +171,7 @@ def _contact_mesh(sensor: Sensor, table: mi.TensorXf) -> mi.Mesh:
     mesh = mi.Mesh("contact", len(shape.vertices), len(shape.faces), properties, has_vertex_normals=True)
     mesh.add_attribute("vertex_contact_fraction", 1, np.zeros(len(shape.vertices), dtype=np.float32))
     parameters = mi.traverse(mesh)
-    parameters["faces"] = mi.UInt32(np.ascontiguousarray(shape.faces, dtype=np.uint32).ravel())
+    parameters["faces"] = numbers(shape.faces)
     parameters["vertex_positions"] = floats(shape.vertices)
     parameters["vertex_normals"] = floats(shape.vertex_normals)
     parameters.update()
@@ -180,11 +181,6 @@ def _contact_mesh(sensor: Sensor, table: mi.TensorXf) -> mi.Mesh:
 def _fraction(sensor: Sensor, deformed: surface.OpticalSurface) -> np.ndarray:
     fraction = real_contact(deformed.pressure_kPa, sensor.skin, sensor.effective_modulus_kPa)
     return surface.with_skirt(fraction)
-
-
-def floats(values: np.ndarray) -> mi.Float:
-    """On the device, in single precision, flat."""
-    return mi.Float(np.ascontiguousarray(values, dtype=np.float32).ravel())
 
 
 def _dielectric(inside: float, outside: float) -> dict[str, Any]:

@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from .build import floats
+from .arrays import floats
 from .disc import disc_rule
 from .disc_rays import Source, arrives, first_guess
 from .irradiance import Layered

@@ -12,7 +12,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .build import floats, led_frame
+from .arrays import floats
+from .build import led_frame
 from .lamp import Patterns
 from .sensor import Sensor
 from .stack import Leg, Way, risen, steepness

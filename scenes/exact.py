@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from . import recurrence, trace, transport, wander
+from .arrays import numbers
 from .bsdf import Table
 from .faces import CONTACT, HOUSING, NOTHING, Faces
 from .housing import Tally
@@ -260,7 +261,7 @@ def exact(
     ray = trace.emit(sensor, number, recurrence.evenly(place, starts))
     begin = (ray, dr.full(mi.Float, 1.0, n_led * samples))
     still = [dr.zeros(mi.Float, n_led * samples) for _ in per]
-    legs = mi.UInt32(np.array([transport.first_leg(led) for led in sensor.leds], dtype=np.uint32))
+    legs = numbers([transport.first_leg(led) for led in sensor.leds])
     leg = dr.gather(mi.UInt32, legs, number)
     dr.while_loop((*begin, mi.UInt32(0), leg, mi.Bool(True), random, *still), going, step)
     scale = np.array([led.flux_W for led in sensor.leds])[:, None, None] / samples

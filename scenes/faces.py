@@ -16,6 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .arrays import floats
 from .sensor import Sensor
 
 NOTHING, CONTACT, TO_GLASS, TO_AIR, WALL, RIM, LED, LAYER, HOUSING = range(9)
@@ -80,12 +81,12 @@ class Faces:
         table = np.zeros((max(number.values()) + 1, 4), dtype=np.float32)
         for name, index in number.items():
             table[index] = (*_normal(name), _kind(name))
-        self._table = mi.Float(table.ravel())
+        self._table = floats(table)
         # inside over outside; inside is the side that the normal points away from
         eta = np.ones(len(table), dtype=np.float32)
         for name, index in number.items():
             eta[index] = _eta(name, sensor)
-        self._eta = mi.Float(eta)
+        self._eta = floats(eta)
 
         contact = shapes["contact"]
         fraction = contact.attribute_buffer("vertex_contact_fraction")

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from . import recurrence, trace, transport
 from .answers import Answers
+from .arrays import floats, numbers
 from .bsdf import Table
 from .build import led_frame
 from .lamp import Patterns
@@ -101,15 +102,15 @@ def _from_leds(stage: Stage, each: int, start: NDArray[np.integer], seed: int) -
     sensor, emission = stage.sensor, stage.emission
     number, u = _lanes(sensor, each, start)
     legs = [transport.first_leg(led) for led in sensor.leds]
-    leg = dr.gather(mi.UInt32, mi.UInt32(np.array(legs, dtype=np.uint32)), number)
+    leg = dr.gather(mi.UInt32, numbers(legs), number)
     one = dr.full(mi.Float, 1.0, len(sensor.leds) * each)
 
     ray = trace.emit(sensor, number, u)
     scores = [mi.Float(0.0) * one for _ in emission.exponent]
     if emission.exponent.any():
         half, floor = sensor.guide.width_mm / 2, -sensor.guide.thickness_mm - sensor.glass.thickness_mm
-        axes = np.array([led_frame(led, half, floor)[1] for led in sensor.leds], dtype=np.float32).T
-        axis = mi.Vector3f(*(dr.gather(mi.Float, mi.Float(part), number) for part in axes.copy()))
+        axes = np.array([led_frame(led, half, floor)[1] for led in sensor.leds]).T
+        axis = mi.Vector3f(*(dr.gather(mi.Float, floats(part), number) for part in axes))
         cosine = dr.dot(ray.d, axis)
         score = Patterns(sensor.leds).score(number, cosine)
         scores = [score * float(unit) for unit in emission.exponent]
@@ -124,8 +125,8 @@ def _from_leds(stage: Stage, each: int, start: NDArray[np.integer], seed: int) -
         ray = trace.emit(sensor, number, u, rim=True)
         sine, cosine = dr.sincos(dr.two_pi * u[0])
         upright = [-1.0 if led.side in ("+x", "-y") else 1.0 for led in sensor.leds]
-        rises = sine * dr.gather(mi.Float, mi.Float(upright), number)
-        per = dr.gather(mi.Float, mi.Float([4.0 / led.diameter_mm for led in sensor.leds]), number)
+        rises = sine * dr.gather(mi.Float, floats(upright), number)
+        per = dr.gather(mi.Float, floats([4.0 / led.diameter_mm for led in sensor.leds]), number)
         scores = [
             per * (cosine * float(emission.along_mm[k]) + rises * float(emission.z_mm[k])) for k in moving
         ]
@@ -140,7 +141,7 @@ def _from_tissue(stage: Stage, upward: Array, each: int, start: NDArray[np.integ
     parts = (stage.scene, sensor, stage.table, coupling, upward[0], number, u)
     ray, amount, scores = trace.re_emit(*parts, stage.answers, list(upward[1:]))
     scale = upward[0, :, 0].mean(axis=(1, 2)) * sensor.guide.width_mm**2
-    amount /= dr.gather(mi.Float, mi.Float(np.maximum(scale, 1e-30)), number)
+    amount /= dr.gather(mi.Float, floats(np.maximum(scale, 1e-30)), number)
     return _walked(stage, number, ray, amount, mi.UInt32(trace.OTHER), seed, scale, stage.answers, scores)
 
 

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import housing
+from .arrays import floats
 from .bsdf import Table
-from .build import floats, led_frame, radiance
+from .build import led_frame, radiance
 from .climb import STEP_MM, climb, descend
 from .irradiance import look_up
 from .lamp import Patterns

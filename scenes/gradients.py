@@ -34,6 +34,7 @@ from threadpoolctl import threadpool_limits
 
 from . import build, direct, gather, housing, surface, transport
 from .answers import Answers
+from .arrays import doubles, floats
 from .contact import ContactOptics
 from .followed import Emission, Stage, follow
 from .irradiance import angular_basis
@@ -163,7 +164,7 @@ def gradients(
         _hang(renderer, pressed, move, step)
         table = renderer.table
         if move.other is not None:
-            table = table.moved(step * mi.Float(move.other.transmittance.astype(np.float32).ravel()))
+            table = table.moved(step * floats(move.other.transmittance))
         glance = gather.glance(renderer.scene, sensor, table, renderer.behind.coupling, renderer.rays)
         answer = gather.answer(glance, step, seen[0], seen[1 + number], transport.MARGIN)
         found[number] = answer.reshape(radiance.shape)
@@ -181,10 +182,10 @@ def fraction_slope(sensor: Sensor, pressure_kPa: Array, name: str, change: Array
     step = dr.opaque(mi.Float64, 0.0)
     dr.enable_grad(step)
     skin, modulus = sensor.skin, sensor.effective_modulus_kPa
-    load = mi.Float64(np.ascontiguousarray(np.maximum(pressure_kPa, 0.0).ravel()))
+    load = doubles(np.maximum(pressure_kPa, 0.0))
     if change is not None:
         rising = np.where(np.asarray(pressure_kPa) > 0.0, change, 0.0)
-        load = load + step * mi.Float64(np.ascontiguousarray(rising.ravel()))
+        load = load + step * doubles(rising)
     slope, kappa = (
         getattr(skin, one) + (step if name == f"skin.{one}" else 0.0) for one in ("rms_slope", "kappa")
     )
@@ -315,7 +316,7 @@ def _hang(renderer: Renderer, pressed: OpticalSurface, move: _Moves, step: mi.Fl
         changes["vertex_normals"] = (high.vertex_normals - low.vertex_normals) * per
     for name, change in changes.items():
         if np.any(change):
-            slope = mi.Float(np.ascontiguousarray(change, dtype=np.float32).ravel())
+            slope = floats(change)
             parameters[f"contact.{name}"] = mi.Float(parameters[f"contact.{name}"]) + step * slope
     parameters.update()
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
 
+from .arrays import floats
 from .aslant import HARMONICS, STEEP
 from .contact import ContactOptics
 from .tissue import Coupling
@@ -96,7 +97,7 @@ class _Columns:
 
     @staticmethod
     def of(columns: Array) -> _Columns:
-        return _Columns(mi.Float(np.ascontiguousarray(columns.T, dtype=np.float32).ravel()), *columns.shape)
+        return _Columns(floats(columns.T), *columns.shape)
 
     def at(self, cosine: mi.Float, active: mi.Bool) -> list[mi.Float]:
         at = dr.clip(cosine, 0.0, 1.0) * (self.nodes - 1)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import ies
+from .arrays import floats
 from .led import Led
 
 _RINGS, _SPOKES = 513, 145  # of the table of a file, over the angle from the axis and about it
@@ -25,10 +26,10 @@ class Patterns:
 
     def __init__(self, leds: Sequence[Led]) -> None:
         self.lambertian = all(led.pattern == "lambertian" and led.tilt_deg == 0.0 for led in leds)
-        self._exponent = mi.Float([led.exponent if led.pattern == "power" else 1.0 for led in leds])
+        self._exponent = floats([(led.exponent or 0.0) if led.pattern == "power" else 1.0 for led in leds])
         tilts = np.radians([led.tilt_deg for led in leds])
         self._tilted = bool(tilts.any())
-        self._lean = [mi.Float(part.astype(np.float32)) for part in (np.cos(tilts), np.sin(tilts))]
+        self._lean = [floats(part) for part in (np.cos(tilts), np.sin(tilts))]
         self._files = {
             number: mi.MarginalContinuous2D0(_table(ies.read(led.ies)))
             for number, led in enumerate(leds)

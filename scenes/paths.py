@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import recurrence, trace
+from .arrays import floats, numbers
 from .bsdf import Table
 from .climb import climb
 from .faces import CONTACT, HOUSING, LED, NOTHING, WALL, Faces
@@ -68,8 +69,8 @@ def from_leds(
     n_led = len(sensor.leds)
     led = np.repeat(np.arange(n_led, dtype=np.uint32), each)
     starts = np.random.Generator(np.random.Philox(seed)).integers(0, 2**32, size=4)
-    place = mi.UInt32(np.tile(np.arange(each, dtype=np.uint32), n_led))
-    number = mi.UInt32(led)
+    place = numbers(np.tile(np.arange(each, dtype=np.uint32), n_led))
+    number = numbers(led)
     ray = trace.emit(sensor, number, recurrence.evenly(place, starts))
     return record(scene, sensor, table, number, ray, seed, bounces)
 
@@ -129,8 +130,7 @@ def record(
 def in_sight(scene: mi.Scene, sensor: Sensor, rays: PixelRays) -> NDArray[np.float64]:
     """Share of the camera's pixels that look straight into each LED, (n_led,)."""
     origin, direction = (
-        [mi.Float(np.ascontiguousarray(part[..., axis], dtype=np.float32).ravel()) for axis in range(3)]
-        for part in (rays.origin_mm, rays.direction)
+        [floats(part[..., axis]) for axis in range(3)] for part in (rays.origin_mm, rays.direction)
     )
     aim = mi.Vector3f(*direction)
     shapes = {shape.id(): mi.ShapePtr(shape) for shape in scene.shapes()}

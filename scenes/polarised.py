@@ -21,6 +21,7 @@ from scipy.ndimage import map_coordinates
 from threadpoolctl import threadpool_limits
 
 from . import build, gather, housing, recurrence, stokes, trace, view
+from .arrays import floats
 from .bsdf import Table
 from .gather import Sight
 from .irradiance import angular_basis
@@ -160,7 +161,7 @@ class Polarised:
         number, u = self._points(each, starts)
         parts = self.scene, self.sensor, self.table, self.under.behind.coupling
         scale = upward[0, :, 0].mean(axis=(1, 2)) * self.sensor.guide.width_mm**2
-        per = dr.gather(mi.Float, mi.Float(np.maximum(scale, 1e-30)), number)
+        per = dr.gather(mi.Float, floats(np.maximum(scale, 1e-30)), number)
         (ray, plain, _), (_, polarised, _) = (trace.re_emit(*parts, one, number, u) for one in upward)
         plain, polarised = plain / per, polarised / per
         left = trace.depart(self.scene, self.sensor, self.table, u)
@@ -214,10 +215,7 @@ def sight_ratios(
 
 
 def _weighed(sight: Sight, ratios: Array) -> Sight:
-    points = [
-        (x, y, gain * mi.Float(ratio.astype(np.float32).ravel()))
-        for (x, y, gain), ratio in zip(sight.points, ratios, strict=True)
-    ]
+    points = [(x, y, gain * floats(ratio)) for (x, y, gain), ratio in zip(sight.points, ratios, strict=True)]
     return replace(sight, points=points)
 
 

@@ -12,6 +12,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from .arrays import numbers
+
 # Fractional parts of powers of 1/phi_4, phi_4 the root of x^5 = x + 1, times 2^32: an additive recurrence
 # that fills the unit 4-cube evenly (Roberts 2018; key roberts2018)
 _RECURRENCE = tuple(int((1.1673039782614187 ** -(k + 1) % 1.0) * 2**32) | 1 for k in range(4))
@@ -22,7 +24,7 @@ def side_by_side(each: int, n_led: int) -> mi.UInt32:
 
     Lanes that run together then meet the same faces and end together: a third less time for the same paths.
     """
-    return mi.UInt32(np.tile(_morton(each), n_led))
+    return numbers(np.tile(_morton(each), n_led))
 
 
 @lru_cache(maxsize=16)

@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .arrays import floats
 from .mueller import ContactMueller
 
 _ALONG = 1e-10  # squared sine to the normal below which all planes of incidence are alike
@@ -77,7 +78,7 @@ class Contact:
     def __init__(self, mueller: ContactMueller) -> None:
         self.rows, self.columns = mueller.real.shape
         parts = (mueller.diattenuation, mueller.real, mueller.imaginary, np.zeros_like(mueller.real))
-        self._data = mi.Float(np.stack(parts, axis=-1).astype(np.float32).ravel())
+        self._data = floats(np.stack(parts, axis=-1))
 
     def at(
         self, fraction: mi.Float, cosine: mi.Float, transmittance: mi.Float, active: mi.Bool

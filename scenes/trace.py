@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .answers import Answers
+from .arrays import floats
 from .bsdf import Table
 from .build import led_frame
 from .faces import CONTACT, HOUSING, LAYER, LED, NOTHING, TO_AIR, TO_GLASS, WALL, Faces, Meeting
@@ -217,7 +218,7 @@ def emit(sensor: Sensor, number: mi.UInt32, u: list[mi.Float], *, rim: bool = Fa
     half, floor = sensor.guide.width_mm / 2, -sensor.guide.thickness_mm - sensor.glass.thickness_mm
     frames = np.array([np.concatenate(led_frame(led, half, floor)) for led in sensor.leds])
     radii = np.array([led.diameter_mm / 2 for led in sensor.leds])
-    columns = [mi.Float(column.astype(np.float32)) for column in (*frames.T, radii)]
+    columns = [floats(column) for column in (*frames.T, radii)]
     centre, axis, tangent = (
         mi.Vector3f(*(dr.gather(mi.Float, columns[3 * i + j], number) for j in range(3))) for i in range(3)
     )
@@ -229,7 +230,7 @@ def emit(sensor: Sensor, number: mi.UInt32, u: list[mi.Float], *, rim: bool = Fa
     direction = patterns.draw(number, mi.Point2f(u[2], u[3]))
     if not patterns.lambertian:  # their y is the LED's upright, this frame's t that or its opposite
         signs = [-1.0 if led.side in ("+x", "-y") else 1.0 for led in sensor.leds]
-        direction.y *= dr.gather(mi.Float, mi.Float(signs), number)
+        direction.y *= dr.gather(mi.Float, floats(signs), number)
     frame = mi.Frame3f(tangent, dr.cross(axis, tangent), axis)
     origin = centre + radius * (on_disc.x * frame.s + on_disc.y * frame.t)
     away = frame.to_world(direction)

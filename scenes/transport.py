@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from . import housing, recurrence, trace
 from .abreast import abreast
+from .arrays import floats, numbers
 from .bsdf import Table
 from .gather import meet
 from .irradiance import AngularBasis, Entrance, smooth, transmitted
@@ -125,7 +126,7 @@ def glance(scene: mi.Scene, sensor: Sensor) -> tuple[mi.Float, mi.Bool]:
     """The same on the device, cell after cell: Dr.Jit differentiates it to the scene's surface."""
     width = sensor.guide.width_mm
     middles = (np.arange(GRID) + 0.5) / GRID * width - width / 2
-    x, y = (mi.Float(values.ravel().astype(np.float32)) for values in np.meshgrid(middles, middles))
+    x, y = (floats(values) for values in np.meshgrid(middles, middles))
     contact = next(shape for shape in scene.shapes() if shape.id() == "contact")
     height = sensor.guide.under_contact_mm(0.5)
     si = meet(scene, mi.ShapePtr(contact), mi.Point3f(x, y, height), mi.Vector3f(0.0, 0.0, 1.0))
@@ -172,12 +173,12 @@ def transport(
         u = recurrence.evenly(recurrence.side_by_side(each, n_led), starts[order])
         if upward is None:
             legs = [first_leg(led) for led in sensor.leds]
-            leg = dr.gather(mi.UInt32, mi.UInt32(np.array(legs, dtype=np.uint32)), number)
+            leg = dr.gather(mi.UInt32, numbers(legs), number)
             ray, amount, scale = trace.emit(sensor, number, u), dr.full(mi.Float, 1.0, n_led * each), flux
         else:
             ray, amount, _ = trace.re_emit(scene, sensor, table, behind.coupling, upward, number, u)
             scale = upward[:, 0].mean(axis=(1, 2)) * sensor.guide.width_mm**2
-            amount /= dr.gather(mi.Float, mi.Float(np.maximum(scale, 1e-30)), number)
+            amount /= dr.gather(mi.Float, floats(np.maximum(scale, 1e-30)), number)
             leg = mi.UInt32(trace.OTHER)
         begun = np.asarray(amount, dtype=np.float64).reshape(n_led, each).mean(axis=1)
         tally = housing.Tally(sensor) if sensor.housing.reflects else None

@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from .arrays import floats
 from .ftir import gap_transmittance
 
 Array = NDArray[np.float64]
@@ -149,7 +150,7 @@ def walk(
     where, direction, weight, through, _, _ = roam(body, where, direction, random, fresnel(*indices))
 
     lot = dr.arange(mi.UInt32, photons) % _LOTS
-    rings = mi.Float(np.concatenate([[0.0], edges]).astype(np.float32))
+    rings = floats(np.concatenate([[0.0], edges]))
     radius = dr.hypot(where.x, where.y)
     ring = dr.binary_search(0, edges.size + 1, lambda i: dr.gather(mi.Float, rings, i) <= radius)
     ring = dr.clip(ring, 1, edges.size + 1) - 1
@@ -276,7 +277,7 @@ def fresnel(n_body: float, n_before: float) -> Passing:
     """A plain face between two indices, unpolarised (Born & Wolf 1999, ch. 1; key born1999)."""
     cosine = np.linspace(0.0, 1.0, _ANGLES) ** 2  # crowded at grazing angles
     t_s, t_p = gap_transmittance(n_body, n_before, n_before, 0.0, cosine, 550.0)
-    table = mi.Float((0.5 * np.asarray(t_s + t_p)).astype(np.float32))
+    table = floats(0.5 * np.asarray(t_s + t_p))
 
     def passing(where: mi.Point3f, cosine: mi.Float) -> mi.Float:
         at = dr.sqrt(dr.clip(cosine, 0.0, 1.0)) * (_ANGLES - 1)

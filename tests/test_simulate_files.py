@@ -22,7 +22,7 @@ import twin.cli
 import twin.stage
 from scenes.exr import read_exr, read_exr_header, read_png
 from twin.frame import FILES, holds_frames, write_frames
-from twin.interrupt import guarded
+from twin.interrupt import guarded, stop_if_asked
 from twin.reporting import summarise
 from twin.stage import staged, staged_file
 
@@ -198,6 +198,26 @@ def test_an_interrupt_inside_an_import_is_raised_after_it(tmp_path, monkeypatch)
     finally:
         signal.signal(signal.SIGINT, kept)
     assert module.loaded == "whole"
+
+
+def test_an_interrupt_inside_an_import_comes_once(tmp_path, monkeypatch):
+    """Raised by whoever asks first, it must not come again into what cleans up."""
+    (tmp_path / "slow_to_load.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "slow_to_load", raising=False)
+    kept, cleaned = signal.signal(signal.SIGINT, signal.default_int_handler), False
+    try:
+        with pytest.raises(KeyboardInterrupt), guarded():
+            import slow_to_load  # noqa: F401
+
+            try:
+                stop_if_asked()
+            finally:
+                time.sleep(0.3)
+                cleaned = True
+    finally:
+        signal.signal(signal.SIGINT, kept)
+    assert cleaned
 
 
 def test_folders_of_killed_runs_go_with_the_next_run(frame, tmp_path, plain_sheet):

@@ -20,6 +20,8 @@ _AGAIN_S = 0.02
 
 class _State:
     asked = False
+    raised = False
+    again = False  # the next signal is our own reminder
     guards = 0
 
 
@@ -30,7 +32,7 @@ def guarded() -> Iterator[None]:
         yield
         return
     if _State.guards == 0:
-        _State.asked = False
+        _State.asked = _State.raised = _State.again = False
     # What is ignored stays so: a shell does that for a job in the background.
     kept = {number: signal.getsignal(number) for number in _SIGNALS}
     kept = {number: handler for number, handler in kept.items() if handler is not signal.SIG_IGN}
@@ -53,12 +55,17 @@ def asked() -> bool:
 def stop_if_asked() -> None:
     """Raise `KeyboardInterrupt` where a signal has come, even if somebody swallowed the first one."""
     if _State.asked:
+        _State.raised = True
         raise KeyboardInterrupt
 
 
 def _heard(number: int, frame: FrameType | None) -> None:
+    reminded, _State.again = _State.again, False
+    if reminded and _State.raised:  # `stop_if_asked` was sooner: leave what cleans up alone
+        return
     _State.asked = True
     if not _importing(frame):
+        _State.raised = True
         raise KeyboardInterrupt
     timer = threading.Timer(_AGAIN_S, _repeat, (signal.Signals(number),))
     timer.daemon = True
@@ -66,7 +73,8 @@ def _heard(number: int, frame: FrameType | None) -> None:
 
 
 def _repeat(number: signal.Signals) -> None:
-    if _State.guards:
+    if _State.guards and not _State.raised:
+        _State.again = True
         _thread.interrupt_main(number)
 
 
