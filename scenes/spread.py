@@ -8,13 +8,14 @@ goes on with bare skin.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
 from .radial import kernel
-from .slab import decay_rate
+from .slab import Slab, decay_rate
 from .tissue import Coupling, TissueOptics
 
 Array = NDArray[np.float64]
@@ -155,21 +156,27 @@ def spreader(tissue: TissueOptics, coupling: Coupling, width_mm: float, cells: i
     """Prepare the spread of light on `cells` x `cells` cells over a face of `width_mm`; some 0.1 s."""
     held, feed, local, back = _without_local(tissue.strengths, coupling.held)
     free = float(_without_local(tissue.strengths, coupling.free[None])[0][0])
-    body = tissue.slab
+    transform = _transform(tissue.slab, free, tissue.transport_per_mm * width_mm / cells, cells)
+    return Spread(transform, cells, free, held, feed, local, back)
+
+
+@lru_cache(maxsize=16)
+def _transform(body: Slab, free: float, step: float, cells: int) -> NDArray[np.float32]:
+    """`Spread.transform` on cells so many transport lengths wide; the sensors of a layout study share it."""
 
     def under_bare_skin(k: Array) -> Array:
         reflectance = body.reflectance(k)
         return np.asarray(reflectance / (1.0 - free * reflectance))
 
     decay = 1.0 + 1.0 / body.depth
-    curve = kernel(under_bare_skin, 0.5 * body.albedo, decay_rate(body.albedo), decay)
-    shares = curve.cells(tissue.transport_per_mm * width_mm / cells, cells)
+    shares = kernel(under_bare_skin, 0.5 * body.albedo, decay_rate(body.albedo), decay).cells(step, cells)
     padded = int(scipy.fft.next_fast_len(2 * cells, real=True))
     away = np.minimum(np.arange(padded), padded - np.arange(padded))
     around = np.where(away < cells, shares[:, np.minimum(away, cells - 1)], 0.0)
     around = np.where((away < cells)[:, None], around[np.minimum(away, cells - 1)], 0.0)
     transform = scipy.fft.rfft2(around, workers=1).real.astype(np.float32)
-    return Spread(transform, cells, free, held, feed, local, back)
+    transform.setflags(write=False)
+    return transform
 
 
 def _without_local(strengths: Array, held: Array) -> tuple[Array, Array, Array, Array]:

@@ -68,6 +68,7 @@ def test_without_noise_both_lights_are_one() -> None:
         assert spread.high_sd < 1e-6 * judged
 
 
+@pytest.mark.slow
 def test_noise_does_not_pass_for_information() -> None:
     """The plain mean of the slopes claims too much, and the range does not, nor do repeats agree too well."""
     Noisy.share = 4.0

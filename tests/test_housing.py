@@ -110,6 +110,7 @@ def test_evenly_lit_box_is_its_radiance_times_the_mirrors(variant: str) -> None:
     assert by_contact[middle] == pytest.approx(expected, rel=2e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tissue", [DENSE], ids=["dense"])
 def test_picture_is_that_of_stock_path(variant: str, tissue: Tissue) -> None:
     """Stock `path` through the same box: an independent code. A corner of the picture, where the veil is a
