@@ -113,6 +113,18 @@ class Table:
             mi.Float(0.0),
         )
 
+    def typical(self, fraction: mi.Float, cos_in: mi.Float, active: mi.Bool | bool = True) -> mi.Float:
+        """About what comes back of the light that passed: it only decides how often to follow it."""
+        back = dr.maximum(self.diffuse(fraction, cos_in, cos_in, active), 1e-3)
+        return back * self.hemispherical(fraction, active)
+
+    def leaving(
+        self, fraction: mi.Float, cos_in: mi.Float, cos_out: mi.Float, active: mi.Bool | bool = True
+    ) -> mi.Float:
+        """What of the light that passed leaves again per solid angle, times cosine, 1/sr."""
+        back = self.diffuse(fraction, cos_in, cos_out, active)
+        return dr.maximum(back * self.transmittance(fraction, cos_out, active), 0.0) * cos_out * dr.inv_pi
+
     def draw(
         self, fraction: mi.Float, sample1: mi.Float, sample2: mi.Point2f, active: mi.Bool | bool = True
     ) -> mi.Vector3f:
@@ -225,7 +237,7 @@ class FrustratedTIR(mi.BSDF):
         a, t = self._at(si, cos_i, active)
         mirror = mi.Float(1.0 if ctx.is_enabled(mi.BSDFFlags.DeltaReflection, 0) else 0.0) * (1.0 - t)
         diffuse = mi.Float(1.0 if ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 1) else 0.0) * t
-        albedo = mirror + diffuse * self._typical(a, cos_i, active)
+        albedo = mirror + diffuse * self.table.typical(a, cos_i, active)
         p_mirror = dr.select(albedo > 0.0, mirror / albedo, 0.0)
         is_mirror = sample1 < p_mirror
 
@@ -245,7 +257,7 @@ class FrustratedTIR(mi.BSDF):
         )
         bs.sampled_component = dr.select(is_mirror, mi.UInt32(0), mi.UInt32(1))
         active &= bs.pdf > 0.0
-        value = diffuse * self._lobe(a, cos_i, cos_spread, active)
+        value = diffuse * self.table.leaving(a, cos_i, cos_spread, active)
         weight = dr.select(is_mirror, albedo, dr.select(bs.pdf > 0.0, value / bs.pdf, 0.0))
         return bs, mi.Color1f(weight) & active
 
@@ -257,7 +269,7 @@ class FrustratedTIR(mi.BSDF):
         if not ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 1):
             return mi.Color1f(0.0)
         a, t = self._at(si, cos_i, active)
-        return mi.Color1f(t * self._lobe(a, cos_i, cos_o, active)) & active
+        return mi.Color1f(t * self.table.leaving(a, cos_i, cos_o, active)) & active
 
     def pdf(
         self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool | bool = True
@@ -268,7 +280,7 @@ class FrustratedTIR(mi.BSDF):
             return mi.Float(0.0)
         a, t = self._at(si, cos_i, active)
         mirror = mi.Float(1.0 if ctx.is_enabled(mi.BSDFFlags.DeltaReflection, 0) else 0.0) * (1.0 - t)
-        albedo = mirror + t * self._typical(a, cos_i, active)
+        albedo = mirror + t * self.table.typical(a, cos_i, active)
         share = dr.select(albedo > 0.0, 1.0 - mirror / albedo, 0.0)
         return dr.select(active, share * self._density(ctx, a, cos_o, active), 0.0)
 
@@ -291,16 +303,6 @@ class FrustratedTIR(mi.BSDF):
         a = self.fraction.eval_1(si, active)
         a = dr.select(dr.isfinite(a), a, 0.0)  # slivers at a pressed-back rim have no barycentric coordinates
         return a, self.table.transmittance(a, cos_i, active)
-
-    def _lobe(self, a: mi.Float, cos_i: mi.Float, cos_o: mi.Float, active: mi.Bool) -> mi.Float:
-        """What of the light that passed leaves per solid angle, times cosine."""
-        value = self.table.diffuse(a, cos_i, cos_o, active) * self.table.transmittance(a, cos_o, active)
-        return dr.maximum(value, 0.0) * cos_o * dr.inv_pi
-
-    def _typical(self, a: mi.Float, cos_i: mi.Float, active: mi.Bool) -> mi.Float:
-        """About what comes back of the light that passed: it only decides how often to follow it."""
-        back = dr.maximum(self.table.diffuse(a, cos_i, cos_i, active), 1e-3)
-        return back * self.table.hemispherical(a, active)
 
     def to_string(self) -> str:
         return f"FrustratedTIR[table = {self.table.rows} x {self.table.columns}]"

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import drjit as dr
 import mitsuba as mi
@@ -20,7 +21,7 @@ from scipy.ndimage import map_coordinates
 from . import recurrence, trace, transport, wander
 from .arrays import numbers
 from .bsdf import Table
-from .faces import CONTACT, HOUSING, NOTHING, Faces
+from .faces import CONTACT, HOUSING, NOTHING, TO_AIR, TO_GLASS, Faces, Meeting
 from .housing import Tally
 from .sensor import Sensor
 from .view import PixelRays, below_mm
@@ -31,6 +32,8 @@ _MAP = 256  # nodes per side of the maps from surface to film
 _FIXED_POINT = float(2**26)
 _MAX_BOUNCES = 512
 _SURE_BOUNCES = 12
+_WORTHWHILE = 0.02  # what a path still carries; of those with less some go on, with as much
+_HAIR_MM = 1e-3
 _BELOW_MM = 0.5  # the surface is looked for from here
 
 
@@ -53,6 +56,7 @@ class Film:
     area_mm2: Array
 
     @staticmethod
+    @lru_cache(maxsize=4)  # passes over one picture share it
     def at(sensor: Sensor, rays: PixelRays, height_mm: float) -> Film:
         """The plane at a height above the contact surface, mm."""
         lean = rays.direction[..., :2] / rays.direction[..., 2:]
@@ -194,11 +198,13 @@ def exact(
     views = [_View.of(film, sensor, 1 + per.size) for film in films]
     contact = next(shape for shape in scene.shapes() if shape.id() == "contact")
     faces = Faces(scene, sensor)
-    context = mi.BSDFContext(mi.TransportMode.Importance)
     spots = wander.Spots.of(sensor, fraction, even)
     lump = None if place is None else wander.Lump.of(sensor, place)
     least = sensor.guide.under_contact_mm(1.0)
     squeezed = (sensor.guide.refractive_index / sensor.tissue.refractive_index) ** 2
+
+    # nothing is in the glass, and what leaves it is gone: down and up again at one go
+    in_one = not sensor.housing.reflects and all(led.side != "below" for led in sensor.leds)
 
     index = dr.arange(mi.UInt32, n_led * samples)
     number = index // mi.UInt32(dr.opaque(mi.UInt32, samples))
@@ -220,6 +226,9 @@ def exact(
             tally.add(number, met.p, throughput, alive & (met.kind == HOUSING))
         u1, u2 = random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32())
         direction, share = trace.bounce_off(sensor, faces, met, alive & ~touches, u1, u2)
+        leaves = trace.leaves(sensor, met) & ~touches
+        direction = dr.select(leaves, met.mirrored, direction)
+        share = dr.select(leaves & alive, faces.reflectance(met), share)
         through, steep = table.steep(met.fraction, met.cosine, touches)
         if local:
             # what leaves towards the camera is known before it is drawn
@@ -233,10 +242,9 @@ def exact(
                 counts = touches & (off > 0.0)
                 counts &= ~trace.is_gathered(leg) if known else True
                 view.add(number, met.p, [glow * seen * dr.dot(met.n, down)], counts)
-            si = scene.ray_intersect(ray, touches)
-            scattered, weight = si.bsdf(ray).sample(context, si, u1, u2, touches)
-            direction = dr.select(touches, si.to_world(scattered.wo), direction)
-            share = dr.select(touches, weight[0], share)
+            scattered, weight = _scattered(table, met, through, u1, u2, touches)
+            direction = dr.select(touches, scattered, direction)
+            share = dr.select(touches, weight, share)
             following = met.leaving(direction)
         else:
             following = met.leaving(dr.select(touches, met.mirrored, direction))
@@ -252,10 +260,15 @@ def exact(
             share = dr.select(enters, left, share)
             following = dr.select(enters, _come_back(scene, contact, back, least), following)
         kept = throughput * share
-        survive = dr.select(bounce < _SURE_BOUNCES, 1.0, dr.minimum(kept, 0.95))
+        survive = dr.minimum(kept / _WORTHWHILE, dr.select(bounce < _SURE_BOUNCES, 1.0, 0.99))
         alive = alive & (kept > 0.0) & (random.next_float32() < survive) & (bounce < _MAX_BOUNCES)
         passed = alive & ~touches & (met.cosine * dr.dot(following.d, met.normal) < 0.0)
         leg = trace.next_leg(leg, met.kind, passed)
+        if in_one:
+            dips = passed & (met.kind == TO_GLASS) & (following.d.z < 0.0)
+            following, mirrored, dips = _mirrored_below(sensor, following, dips)
+            kept = dr.select(dips, kept * mirrored, kept)
+            leg = dr.select(dips, trace.next_leg(leg, mi.UInt32(TO_AIR), mi.Bool(False)), leg)
         return following, dr.select(alive, kept / survive, 0.0), bounce + 1, leg, alive, random, *scores
 
     ray = trace.emit(sensor, number, recurrence.evenly(place, starts))
@@ -282,6 +295,37 @@ def mirrored_run_mm(sensor: Sensor) -> float:
     """How much deeper in the guide the surface seems when it is seen by the glass's lower face, near the
     axis."""
     return 2.0 * (sensor.guide.top_mm + below_mm(sensor))
+
+
+def _mirrored_below(sensor: Sensor, ray: mi.Ray3f, active: mi.Bool) -> tuple[mi.Ray3f, mi.Float, mi.Bool]:
+    """Rays into the glass as they come back from its lower face, the share that does, and which do: those
+    that meet no side on the way."""
+    glass, floor = sensor.glass, -sensor.guide.thickness_mm - sensor.glass.thickness_mm
+    run = (floor - ray.o.z) / dr.select(active, ray.d.z, -1.0)
+    at = ray(run)
+    active = active & (dr.maximum(dr.abs(at.x), dr.abs(at.y)) < sensor.guide.width_mm / 2)
+    share = mi.fresnel(ray.d.z, mi.Float(glass.refractive_index))[0]
+    if glass.absorption_per_mm > 0.0:
+        share = share * dr.exp(-glass.absorption_per_mm * run)
+    back = mi.Ray3f(mi.Point3f(at.x, at.y, floor + _HAIR_MM), mi.Vector3f(ray.d.x, ray.d.y, -ray.d.z))
+    return dr.select(active, back, ray), share, active
+
+
+def _scattered(
+    table: Table, met: Meeting, through: mi.Float, sample1: mi.Float, sample2: mi.Point2f, active: mi.Bool
+) -> tuple[mi.Vector3f, mi.Float]:
+    """Where light goes on from the contact surface, and its weight: drawn as `FrustratedTIR.sample` does, at
+    the place that is known already."""
+    mirrors = 1.0 - through
+    albedo = mirrors + through * table.typical(met.fraction, met.cosine, active)
+    share = dr.select(albedo > 0.0, mirrors / albedo, 0.0)
+    rest = (sample1 - share) / dr.maximum(1.0 - share, 1e-6)
+    spread = table.draw(met.fraction, rest, sample2, active)
+    density = (1.0 - share) * table.density(met.fraction, spread.z, active)
+    value = through * table.leaving(met.fraction, met.cosine, spread.z, active)
+    is_mirrored = sample1 < share
+    weight = dr.select(is_mirrored, albedo, dr.select(density > 0.0, value / density, 0.0))
+    return dr.select(is_mirrored, met.mirrored, mi.Frame3f(met.normal).to_world(spread)), weight
 
 
 def _come_back(scene: mi.Scene, contact: mi.Shape, ray: mi.Ray3f, least: float) -> mi.Ray3f:

@@ -122,6 +122,10 @@ class Faces:
         """Index inside over that outside, as `mi.fresnel` takes it."""
         return dr.gather(mi.Float, self._eta, dr.reinterpret_array(mi.UInt32, meeting.shape))
 
+    def reflectance(self, meeting: Meeting) -> mi.Float:
+        """Share of the light that a flat dielectric face mirrors."""
+        return mi.fresnel(meeting.cosine, self.eta(meeting))[0]
+
     def polished(self, meeting: Meeting, sample: mi.Float) -> mi.Vector3f:
         """Direction after a flat dielectric face: mirrored with Fresnel's share as chance, else refracted."""
         mirrored, cosine, _, squeeze = mi.fresnel(meeting.cosine, self.eta(meeting))

@@ -351,6 +351,14 @@ def bounce_off(
     return direction, share
 
 
+def leaves(sensor: Sensor, met: Meeting) -> mi.Bool:
+    """Where light that a face lets through never comes back: out of the glass, and out of polished walls."""
+    outwards = (met.kind == TO_AIR) & (not sensor.housing.reflects)
+    if sensor.guide.walls == "polished":
+        outwards |= met.kind == WALL
+    return outwards & (met.cosine < 0.0)
+
+
 def painted(sensor: Sensor, met: Meeting, active: mi.Bool) -> mi.Bool:
     """Where walls are painted: all over, but for the windows before LEDs in air."""
     half, found = sensor.guide.width_mm / 2, active & (met.kind == WALL)

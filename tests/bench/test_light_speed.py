@@ -69,7 +69,7 @@ def test_equal_noise_sooner_than_path(variant: str, coupling: str) -> None:
     sight = gather.look(scene, renderer.sensor, renderer.table, renderer.behind.coupling, renderer.rays)
     parts = (scene, renderer.sensor, renderer.table, renderer.rays, fraction)
     straight = local.straight(*parts[:4])
-    exact.exact(*parts, 2**10, 0, local=True, gathered=straight)
+    exact.exact(*parts, 2**10, 0, local=True, gathered=straight)  # compile
 
     pictures: dict[str, list[np.ndarray]] = {"standard": [], "reference": []}
     seconds, once = dict.fromkeys(pictures, 0.0), {"standard": 0.0, "reference": np.inf}
@@ -83,7 +83,7 @@ def test_equal_noise_sooner_than_path(variant: str, coupling: str) -> None:
         straight = local.straight(*parts[:4])
         once["reference"] = min(once["reference"], time.perf_counter() - start)
         start = time.perf_counter()
-        seen = exact.exact(*parts, 2**18, seed, local=True, gathered=straight)
+        seen = exact.exact(*parts, 2**20, seed, local=True, gathered=straight)
         pictures["reference"].append(in_blob(np.einsum("snyx,syx->yx", seen, sight.windows)))
         seconds["reference"] += time.perf_counter() - start
 
