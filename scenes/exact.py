@@ -30,9 +30,6 @@ Array = NDArray[np.float64]
 
 _MAP = 256  # nodes per side of the maps from surface to film
 _FIXED_POINT = float(2**26)
-_MAX_BOUNCES = 512
-_SURE_BOUNCES = 12
-_WORTHWHILE = 0.02  # what a path still carries; of those with less some go on, with as much
 _HAIR_MM = 1e-3
 _BELOW_MM = 0.5  # the surface is looked for from here
 
@@ -260,8 +257,8 @@ def exact(
             share = dr.select(enters, left, share)
             following = dr.select(enters, _come_back(scene, contact, back, least), following)
         kept = throughput * share
-        survive = dr.minimum(kept / _WORTHWHILE, dr.select(bounce < _SURE_BOUNCES, 1.0, 0.99))
-        alive = alive & (kept > 0.0) & (random.next_float32() < survive) & (bounce < _MAX_BOUNCES)
+        survive = trace.chance(kept, bounce)
+        alive = alive & (kept > 0.0) & (random.next_float32() < survive) & (bounce < trace.MAX_BOUNCES)
         passed = alive & ~touches & (met.cosine * dr.dot(following.d, met.normal) < 0.0)
         leg = trace.next_leg(leg, met.kind, passed)
         if in_one:

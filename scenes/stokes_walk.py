@@ -21,7 +21,7 @@ from .bsdf import Table
 from .faces import CONTACT, LED, NOTHING, TO_AIR, TO_GLASS, WALL, Faces
 from .irradiance import AngularBasis
 from .sensor import Sensor
-from .trace import CELLS, SINKS, absorb, bounce_off, painted
+from .trace import CELLS, MAX_BOUNCES, SINKS, absorb, bounce_off, chance, painted
 
 Array = NDArray[np.float64]
 
@@ -29,8 +29,6 @@ KINDS = ("unpolarised", "polarised")
 """Of light, the leading axis of all that is counted."""
 
 _FIXED_POINT = float(2**20)
-_MAX_BOUNCES = 512
-_SURE_BOUNCES = 12
 
 
 @dataclass(frozen=True)
@@ -146,8 +144,8 @@ def walk(
             ("frame", (met.kind != LED) & (met.kind != WALL)),
         ):
             end(name, elsewhere & ~clear & where, throughput - kept, light.x - after.x)
-        survive = dr.select(bounce < _SURE_BOUNCES, 1.0, dr.minimum(kept, 0.95))
-        alive = alive & (kept > 0.0) & (random.next_float32() < survive) & (bounce < _MAX_BOUNCES)
+        survive = chance(kept, bounce)
+        alive = alive & (kept > 0.0) & (random.next_float32() < survive) & (bounce < MAX_BOUNCES)
         throughput, light = dr.select(alive, kept / survive, 0.0), dr.select(alive, after / survive, 0.0)
         return met.leaving(direction), throughput, light, side, bounce + 1, alive, random, *sinks
 

@@ -37,10 +37,11 @@ housing that reflects."""
 
 # Deposits are summed as integers: the sum does not depend on the order of threads
 _FIXED_POINT = float(2**20)
-_MAX_BOUNCES = 512
+MAX_BOUNCES = 512
 # Legs of the two families of paths that `direct` gathers, and any other
 IN_AIR, IN_GUIDE, _DOWN, _IN_GLASS_UP, _BACK_UP, OTHER = range(6)
-_SURE_BOUNCES = 12  # before Russian roulette
+_SURE_BOUNCES, _GO_ON = 12, 0.99  # before Russian roulette, and the chance to go on after them
+_WORTHWHILE = 0.02  # what a path still carries; of those with less some go on, with as much
 
 
 @dataclass(frozen=True)
@@ -170,8 +171,8 @@ def walk(
         passed = elsewhere & (cosine * dr.dot(direction, met.normal) < 0.0)
         leg = next_leg(leg, met.kind, passed)
 
-        survive = dr.select(bounce < _SURE_BOUNCES, 1.0, dr.minimum(kept, 0.95))
-        alive = alive & (kept > 0.0) & (random.next_float32() < survive) & (bounce < _MAX_BOUNCES)
+        survive = chance(kept, bounce)
+        alive = alive & (kept > 0.0) & (random.next_float32() < survive) & (bounce < MAX_BOUNCES)
         throughput = dr.select(alive, kept / survive, 0.0)
         rest = (*sink.values(), *scores)
         return met.leaving(direction), throughput, bounce + 1, leg, alive, random, trapped, *rest
@@ -327,6 +328,14 @@ def absorb(sensor: Sensor, ray: mi.Ray3f, met: Meeting, throughput: mi.Float) ->
         name: dr.select(within & here, throughput * (1.0 - dr.exp(-absorption * met.t)), 0.0)
         for name, absorption, here in media
     }
+
+
+def chance(kept: mi.Float, bounce: mi.UInt32) -> mi.Float:
+    """With what chance a path goes on, its weight divided by it, that carries so much.
+
+    Few paths end that carry much: others would carry more than all, and be the picture's noise.
+    """
+    return dr.minimum(kept / _WORTHWHILE, dr.select(bounce < _SURE_BOUNCES, 1.0, _GO_ON))
 
 
 def bounce_off(
