@@ -104,7 +104,7 @@ def test_equal_noise_sooner_than_path(variant: str, coupling: str) -> None:
 
 def _frames(folder: str, worker: int, ready: Barrier, told: Queue[Shift]) -> None:
     """As one of `twin corpus`' workers: FRAMES frames, each of another pressure."""
-    from twin.labour import prepare
+    from twin.labour import prepare, sweep
 
     prepare()
     from scenes import Renderer, expose
@@ -121,6 +121,7 @@ def _frames(folder: str, worker: int, ready: Barrier, told: Queue[Shift]) -> Non
         found = renderer.render(surface, quality="preview", seed=number + 3, samples=PATHS)
         counts = expose(renderer.sensor.camera, found.radiance.sum(axis=0, dtype=np.float64), 550.0, rng)
         write_png(Path(folder) / f"{worker}_{number}.png", counts)
+        sweep()
         resident.append(_resident_gib())
     seconds, processor = time.perf_counter() - start, time.process_time() - processor
     relight = []
