@@ -213,8 +213,7 @@ class WrongCorpus(ValueError):
 def give_back() -> None:
     """Return memory that nobody uses to the system: Python's, Dr.Jit's and the C library's.
 
-    Dr.Jit compiles a kernel anew now and then, and keeps all: a fifth of a MiB a frame. On the disk they are
-    in any case.
+    Dr.Jit keeps all kernels that it ever compiled, a fifth of a MiB each; they are on the disk in any case.
     """
     gc.collect()  # cycles of arrays, some tens of MiB between two collections of Python's own
     if drjit := sys.modules.get("drjit"):
