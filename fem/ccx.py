@@ -263,7 +263,7 @@ def _step(out: StringIO, model: Bodies, level: float, finite: bool, increments: 
     out.write(f"*STEP, NLGEOM, INC=200\n*STATIC\n{increments}\n" if finite else "*STEP\n*STATIC\n")
     out.write("*BOUNDARY\n")
     for axis, moved in enumerate((model.start - level) * model.normal):
-        out.write(f"CHEST, {axis + 1}, {axis + 1}, {float(moved)!r}\n")
+        out.write(f"CHEST, {axis + 1}, {axis + 1}, {_number(moved)}\n")
     out.write("*NODE PRINT, NSET=TIP, FREQUENCY=1000\nU\n")
     out.write("*NODE PRINT, NSET=CHEST, FREQUENCY=1000, TOTALS=ONLY\nRF\n")
     out.write("*NODE FILE, FREQUENCY=1000\nU, RF\n")
@@ -309,7 +309,7 @@ def _mesh(out: StringIO, model: Bodies, bricks: Ints, used: NDArray[np.bool_], e
     out.write("*NODE, NSET=ALL\n")
     nodes = np.flatnonzero(used)
     for i, (x, y, z) in zip(nodes + 1, model.place[nodes].tolist(), strict=True):
-        out.write(f"{i}, {x!r}, {y!r}, {z!r}\n")
+        out.write(f"{i}, {_number(x)}, {_number(y)}, {_number(z)}\n")
     for kind, material in enumerate(model.materials):
         out.write(f"*ELEMENT, TYPE={element}, ELSET={material.name}\n")
         for i in np.flatnonzero(model.material == kind):
@@ -328,11 +328,11 @@ def _mesh(out: StringIO, model: Bodies, bricks: Ints, used: NDArray[np.bool_], e
 def _material(material: Material, finite: bool) -> str:
     """Hooke's law, or W = C10 (J^(-2/3) tr C - 3) + (J - 1)^2 / D1, with the same moduli at small strain."""
     if not finite:
-        law = f"*ELASTIC\n{material.modulus_kPa!r}, {material.poisson!r}\n"
+        law = f"*ELASTIC\n{_number(material.modulus_kPa)}, {_number(material.poisson)}\n"
     else:
         shear = material.modulus_kPa / (2 * (1 + material.poisson))
         bulk = material.modulus_kPa / (3 * (1 - 2 * material.poisson))
-        law = f"*HYPERELASTIC, NEO HOOKE\n{shear / 2!r}, {2 / bulk!r}\n"
+        law = f"*HYPERELASTIC, NEO HOOKE\n{_number(shear / 2)}, {_number(2 / bulk)}\n"
     return f"*MATERIAL, NAME={material.name}\n{law}"
 
 
@@ -351,5 +351,10 @@ def _contact(out: StringIO, model: Bodies, bricks: Ints, stiffness: float) -> No
             out.write(f"{element}, S{face}\n")
     out.write("*SURFACE INTERACTION, NAME=SMOOTH\n*SURFACE BEHAVIOR, PRESSURE-OVERCLOSURE=LINEAR\n")
     out.write(
-        f"{stiffness!r}\n*CONTACT PAIR, INTERACTION=SMOOTH, TYPE=SURFACE TO SURFACE\nTIPFACE, SKINFACE\n"
+        f"{_number(stiffness)}\n*CONTACT PAIR, INTERACTION=SMOOTH, TYPE=SURFACE TO SURFACE\nTIPFACE, SKINFACE\n"
     )
+
+
+def _number(value: float) -> str:
+    """A number in a deck: CalculiX reads twenty characters and drops the rest, exponents too."""
+    return f"{float(value):.12g}"

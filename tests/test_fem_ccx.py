@@ -172,3 +172,15 @@ def test_chest_wall_moves_along_the_tilted_axis(tmp_path: Path) -> None:
     text = ccx.write(tmp_path / "a.inp", found, [1.0]).read_text()
     moved = [float(line.split(",")[3]) for line in text.splitlines() if line.startswith("CHEST, ")][:3]
     np.testing.assert_allclose(moved, (found.start - 1) * found.normal)
+
+
+def test_numbers_are_short_enough_for_calculix(tmp_path: Path) -> None:
+    """It reads twenty characters of each: what is beyond, an exponent too, would be lost."""
+    found = ccx.bodies(Geometry(PROBE, SLAB, INCLUSIONS[0], Pose((0.0, 2.0))), COARSE_EDGE)
+    lines = ccx.write(tmp_path / "a.inp", found, [1.0]).read_text().splitlines()
+    fields = [field for line in lines if line[0] not in "*" for field in line.split(",")]
+    assert max(map(len, fields)) <= 20
+    start = next(i for i, line in enumerate(lines) if line.startswith("*NODE"))
+    end = next(i for i, line in enumerate(lines) if line.startswith("*ELEMENT"))
+    table = np.array([[float(field[:20]) for field in line.split(",")] for line in lines[start + 1 : end]])
+    np.testing.assert_allclose(table[:, 1:], found.place[table[:, 0].astype(int) - 1], rtol=0, atol=1e-9)
