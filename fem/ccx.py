@@ -350,9 +350,8 @@ def _contact(out: StringIO, model: Bodies, bricks: Ints, stiffness: float) -> No
         for element, face in faces_on(bricks, nodes):
             out.write(f"{element}, S{face}\n")
     out.write("*SURFACE INTERACTION, NAME=SMOOTH\n*SURFACE BEHAVIOR, PRESSURE-OVERCLOSURE=LINEAR\n")
-    out.write(
-        f"{_number(stiffness)}\n*CONTACT PAIR, INTERACTION=SMOOTH, TYPE=SURFACE TO SURFACE\nTIPFACE, SKINFACE\n"
-    )
+    out.write(f"{_number(stiffness)}\n*CONTACT PAIR, INTERACTION=SMOOTH, TYPE=SURFACE TO SURFACE\n")
+    out.write("TIPFACE, SKINFACE\n")
 
 
 def _number(value: float) -> str:
