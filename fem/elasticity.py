@@ -20,7 +20,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from fem.quadrature import DOFS, NODES, Quadrature
+from fem.quadrature import BY_REFERENCE, DOFS, NODES, Quadrature
 
 Floats = NDArray[np.float64]
 
@@ -124,6 +124,50 @@ def forces(quad: Quadrature, moved: Floats, shear: Floats, bulk: Floats) -> tupl
         flat = gradient.transpose(0, 2, 1, 3).reshape(n, NODES, 3 * q)
         out[part] = flat @ piola.transpose(0, 3, 1, 2).reshape(n, 3 * q, 3)
     return out, energy
+
+
+def linear_forces(quad: Quadrature, local: Floats, shear: Floats, bulk: Floats) -> Floats:
+    """Forces at small strain: the product of the stiffness at rest with displacements, without the former.
+
+    Parameters
+    ----------
+    local
+        Displacements of each element's nodes, (m, 27, 3) mm.
+    shear, bulk
+        Moduli of each element, (m,) kPa.
+
+    Returns
+    -------
+    (m, 27, 3) array, mN.
+    """
+    out = np.empty_like(local)
+    for part in _chunks(quad.size):
+        inverse, weight, modes = quad.inverse[part], quad.weight[part], quad.modes[part]
+        n, q = weight.shape
+        slope = inverse @ (BY_REFERENCE @ local[part]).reshape(n, q, 3, 3)  # du_b / dx_a at [a, b]
+        volume = np.trace(slope, axis1=2, axis2=3)
+        share = (modes @ (weight * volume)[:, :, None]).transpose(0, 2, 1)
+        pressure = bulk[part][:, None] * (share @ modes)[:, 0]
+        mu = shear[part][:, None]
+        stress = mu[..., None, None] * (slope + slope.swapaxes(2, 3))
+        for a in range(3):
+            stress[..., a, a] += pressure - (2 / 3) * mu * volume
+        stress *= weight[..., None, None]
+        back = (inverse.swapaxes(2, 3) @ stress).reshape(n, 3 * q, 3)
+        out[part] = BY_REFERENCE.T @ back
+    return out
+
+
+def largest(quad: Quadrature, shear: Floats, bulk: Floats) -> float:
+    """The largest entry of all elements' stiffness at rest, kPa mm: one of a diagonal, as it is definite."""
+    found = 0.0
+    for part in _chunks(quad.size):
+        gradient, weight = quad.gradient(part), quad.weight[part]  # (n, 3, 27, q)
+        square = (gradient**2 * (shear[part][:, None] * weight)[:, None, None]).sum(axis=3)
+        change = gradient @ (weight[:, None] * quad.modes[part])[:, None].swapaxes(2, 3)
+        volume = bulk[part][:, None, None] * (change**2).sum(axis=3)
+        found = max(found, float((square.sum(axis=1, keepdims=True) + square / 3 + volume).max()))
+    return found
 
 
 def stiffness(

@@ -21,7 +21,7 @@ from fem import elasticity, solver
 from fem.contact import Tie
 from fem.elasticity import Inverted
 from fem.meshed import Model
-from fem.quadrature import DOFS
+from fem.operators import AtRest, Sheared, Stiffness, product
 from fem.system import System
 
 Floats = NDArray[np.float64]
@@ -35,7 +35,6 @@ _NEWTON = 20  # steps at most
 _PATIENCE = 12  # steps after which the residual must have come down to a hundredth of the reaction
 _DAMPING, _STRONGEST = 0.05, 0.8  # share of the stiffness at rest added where the tangent is not definite
 _WORTH = 15  # iterations of conjugate gradients that are worth a new factor
-_CHUNK = 128  # element matrices made double at a time
 _TURNS = 12  # of the slab's mesh and the slopes at most
 _STRICT = 8  # turns after which the probe's edge may still want to move by more
 _MEMORY = 5  # turns that the next one is extrapolated from
@@ -76,46 +75,13 @@ class Effort:
     sets: int = 0
 
 
-@dataclass(frozen=True)
-class Stiffness:
-    """Element matrices (m, 81, 81), those of some elements replaced: what bodies share is stored once."""
-
-    matrices: NDArray[np.floating]
-    other: Ints | None = None
-    instead: NDArray[np.floating] | None = None
-
-    def __call__(self, elements: Ints) -> NDArray[np.floating]:
-        """Matrices of some elements."""
-        found = self.matrices[elements]
-        if self.other is not None and self.instead is not None:
-            at = np.searchsorted(self.other, elements)
-            hit = self.other[np.minimum(at, len(self.other) - 1)] == elements
-            found[hit] = self.instead[at[hit]]
-        return found
-
-    def plus(self, share: float, other: Stiffness) -> Stiffness:
-        """The sum with a share of others."""
-        every = np.arange(len(self.matrices))
-        return Stiffness(self.matrices + np.float32(share) * other(every))
-
-    def sheared(self, cells: Ints, slope: Floats) -> Stiffness:
-        """In the unknowns x, y and z - G . (x, y) at each node; slope G (nodes, 2)."""
-        touched = np.flatnonzero(np.abs(slope[cells]).max(axis=(1, 2)) > 0)
-        some = self(touched).copy()
-        g = slope[cells[touched]].astype(some.dtype)  # (n, 27, 2)
-        for a in (0, 1):
-            some[:, :, a::3] += some[:, :, 2::3] * g[:, None, :, a]
-            some[:, a::3] += some[:, 2::3] * g[:, :, a, None]
-        return Stiffness(self.matrices, touched, some)
-
-
 @dataclass
 class Body:
     """All moduli, and the factors found so far."""
 
     shear: Floats
     bulk: Floats
-    rest: Stiffness  # of the undeformed elements
+    rest: AtRest
     finite: bool
     stiff: bool  # with the inclusion
     factors: dict[bytes, Preconditioner] = field(default_factory=dict)
@@ -124,10 +90,8 @@ class Body:
     @cached_property
     def floor(self) -> float:
         """Residual that is rounding, mN: what the largest entries leave after they cancel."""
-        entries = self.rest.matrices  # hundreds of megabytes: no copy of them
-        kind, largest = entries.dtype, float(max(entries.max(), -entries.min()))
-        double = kind == np.float64 or self.finite  # finite strain's forces do not come from the matrices
-        return (1e4 * float(np.finfo(np.float64).eps) if double else 20 * float(np.finfo(kind).eps)) * largest
+        largest = elasticity.largest(self.rest.quad, self.shear, self.bulk)
+        return 1e4 * float(np.finfo(np.float64).eps) * largest
 
     def forces(self, model: Model, moved: Floats) -> tuple[Floats, float]:
         """Internal forces (nodes, 3), mN, and stored energy, µJ."""
@@ -137,20 +101,20 @@ class Body:
         total = model.nodal(product(self.rest, moved, model))
         return total, 0.5 * float((total * moved).sum())
 
-    def tangent(self, model: Model, moved: Floats) -> Stiffness:
+    def tangent(self, model: Model, moved: Floats) -> AtRest | Stiffness:
         """Tangent stiffness of the elements."""
         if not model.finite:
             return self.rest
         return Stiffness(elasticity.stiffness(model.quad, self.shear, self.bulk, moved, dtype=np.float32))
 
     def factor(
-        self, sys: System, matrices: Stiffness, slope: Floats | None = None, renew: bool = False
+        self, sys: System, matrices: AtRest | Stiffness, slope: Floats | None = None, renew: bool = False
     ) -> Preconditioner:
         """Factor of the tied stiffness for a set of closed pairs; an old one serves unless renewed."""
         key = sys.closed.tobytes()
         if renew or key not in self.factors:
             self.factors.clear()  # before the next one: the largest of all memory
-            made = matrices if slope is None else matrices.sheared(sys.nodes.cells, slope)
+            made = matrices if slope is None else Sheared(matrices, sys.nodes.cells, slope)
             # a tangent that is not definite in single precision is damped, rather than factored in double
             factor = solver.Factor(sys.tree, made, again=slope is None)
             self.factors[key] = Preconditioner(sys, factor if slope is None else factor.bare(), slope)
@@ -187,17 +151,6 @@ class Preconditioner:
             lift[free] += (g[free]) * found[level[free]]
         found[rise] = lift
         return found
-
-
-def product(matrices: Stiffness, moved: Floats, model: Model) -> Floats:
-    """Forces (m, 27, 3) of element matrices on displacements (nodes, 3); sums are double in any case."""
-    local = moved[model.nodes.cells].reshape(-1, DOFS, 1)
-    force = np.empty_like(local)
-    for start in range(0, len(local), _CHUNK):
-        part = np.arange(start, min(start + _CHUNK, len(local)))
-        some = matrices(part).astype(np.float64, copy=False)
-        np.matmul(some, local[part], out=force[start : start + len(part)])
-    return force.reshape(-1, 27, 3)
 
 
 def equilibrium(body: Body, guess: State) -> State:
@@ -317,7 +270,9 @@ def _step(
     """Newton's step as `_solve` gives it, with at least so much damping, and the damping it took."""
     tangent = body.tangent(start.model, moved)
     while True:
-        matrices = tangent if damping == 0 else tangent.plus(damping, body.rest)
+        matrices = tangent
+        if damping > 0 and isinstance(tangent, Stiffness):
+            matrices = tangent.plus(damping, body.rest)
         try:
             return _solve(body, start.model, sys, start.tie, matrices, load, renew), damping
         except (Indefinite, np.linalg.LinAlgError):
@@ -331,7 +286,7 @@ def _solve(
     model: Model,
     sys: System,
     bond: Tie,
-    matrices: Stiffness,
+    matrices: AtRest | Stiffness,
     load: Floats,
     renew: bool,
 ) -> tuple[Floats, int, float]:

@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fem import elasticity
 from fem.contact import level
 from fem.elasticity import Inverted
-from fem.equilibrium import Body, NotConverged, State, Stiffness, equilibrium, product
+from fem.equilibrium import Body, NotConverged, State, equilibrium
 from fem.mesh import Geometry
 from fem.meshed import Model, moduli
+from fem.operators import AtRest, product
 
 Floats = NDArray[np.float64]
 
@@ -199,14 +199,7 @@ class Path:
 def path(geometry: Geometry, model: Model, inclusion: bool, beside: Path | None = None) -> Path:
     """Start at first touch. `beside`: the path without inclusion, whose factor is shared."""
     shear, bulk = moduli(geometry, model, inclusion)
-    if beside is None:
-        # linear forces come from these matrices: single precision, amplified by the bulk modulus, would cost
-        # the balance of forces 1e-4 and more. Finite strain takes its forces from the energy.
-        kind = np.float32 if model.finite else np.float64
-        rest = Stiffness(elasticity.stiffness(model.quad, shear, bulk, dtype=kind))
-    else:
-        ball = elasticity.stiffness(model.quad, shear[model.ball], bulk[model.ball], elements=model.ball)
-        rest = replace(beside.body.rest, other=model.ball, instead=ball)
+    rest = AtRest(model.quad, shear, bulk, np.float32 if model.finite else np.float64)
     body = Body(shear, bulk, rest, model.finite, inclusion, {} if beside is None else beside.body.factors)
     still = np.zeros_like(model.place)
     bond = level(model.interface)

@@ -20,6 +20,8 @@ _POINTS, _WEIGHTS = get_quadrature(ElementHex2.refdom, 4)
 _BASIS = [ElementHex2().lbasis(_POINTS, i) for i in range(NODES)]
 SHAPE = np.stack([value for value, _ in _BASIS])  # (27 nodes, 27 points)
 _REFERENCE = np.stack([gradient for _, gradient in _BASIS])  # (27 nodes, 3, 27 points)
+BY_REFERENCE = np.ascontiguousarray(_REFERENCE.transpose(2, 1, 0).reshape(-1, NODES))
+"""Derivatives along the reference coordinates at the points, of values at the nodes: (27 points * 3, 27)."""
 
 
 @dataclass(frozen=True)

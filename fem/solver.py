@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, Literal
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +29,20 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Array = NDArray[Any]  # of the fronts' precision
 Precision = Literal["single", "double"]
-Matrices = NDArray[np.floating] | Callable[[Ints], NDArray[np.floating]]
+
+
+@runtime_checkable
+class Operator(Protocol):
+    """Element matrices that also know a better way to their products."""
+
+    def __call__(self, elements: Ints) -> NDArray[np.floating]:
+        """Matrices of some elements, (n, k, k)."""
+
+    def times(self, local: Floats) -> Floats:
+        """Products of all with unknowns (elements, k)."""
+
+
+Matrices = NDArray[np.floating] | Callable[[Ints], NDArray[np.floating]] | Operator
 
 _KIND: dict[str, np.dtype[Any]] = {"single": np.dtype(np.float32), "double": np.dtype(np.float64)}
 _RESTARTS, _ITERATIONS = 6, 60  # of conjugate gradients
@@ -202,12 +215,15 @@ def apply(tree: Tree, matrices: Matrices, x: Floats) -> Floats:
 
     Sums are double, also where the matrices are kept in single precision, which takes no longer.
     """
-    local = np.append(x, 0.0)[tree.dofs][:, :, None]
-    force = np.empty_like(local)
-    for start in range(0, len(local), _CHUNK):
-        part = slice(start, start + _CHUNK)
-        some = matrices(np.arange(len(local))[part]) if callable(matrices) else matrices[part]
-        np.matmul(some.astype(np.float64, copy=False), local[part], out=force[part])
+    local = np.append(x, 0.0)[tree.dofs]
+    if isinstance(matrices, Operator):
+        force = matrices.times(local)
+    else:
+        force = np.empty_like(local)
+        for start in range(0, len(local), _CHUNK):
+            part = slice(start, start + _CHUNK)
+            some = matrices(np.arange(len(local))[part]) if callable(matrices) else matrices[part]
+            np.matmul(some.astype(np.float64, copy=False), local[part, :, None], out=force[part, :, None])
     held = np.where(tree.dofs < 0, tree.size, tree.dofs)
     total = np.bincount(held.ravel(), weights=force.ravel(), minlength=tree.size + 1)
     return np.asarray(total[:-1], dtype=float)

@@ -9,7 +9,8 @@ from scipy.sparse.linalg import LinearOperator, lobpcg
 
 import fem
 from fem import mesh, solver
-from fem.equilibrium import Body, NotConverged, Preconditioner, State, Stiffness, product
+from fem.equilibrium import Body, NotConverged, Preconditioner, State
+from fem.operators import AtRest, Stiffness, product
 from fem.mesh import Geometry
 from fem.meshed import build
 from fem.path import path
@@ -33,7 +34,7 @@ def softest(body: Body, state: State) -> tuple[float, float]:
         change[tip, 2] = bond.height(change)
         return change
 
-    def operator(matrices: Stiffness) -> LinearOperator:
+    def operator(matrices: AtRest | Stiffness) -> LinearOperator:
         def apply(values: Floats) -> Floats:
             force = model.nodal(product(matrices, expand(values), model))
             return sys.gather(bond.hand_on(force, force[tip, 2]))
