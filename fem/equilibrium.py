@@ -21,7 +21,7 @@ from fem import elasticity, solver
 from fem.contact import Tie
 from fem.elasticity import Inverted
 from fem.meshed import Model
-from fem.operators import AtRest, Sheared, Stiffness, product
+from fem.operators import AtRest, Matrices, Sheared, Tangent, product
 from fem.system import System
 
 Floats = NDArray[np.float64]
@@ -101,14 +101,14 @@ class Body:
         total = model.nodal(product(self.rest, moved, model))
         return total, 0.5 * float((total * moved).sum())
 
-    def tangent(self, model: Model, moved: Floats) -> AtRest | Stiffness:
+    def tangent(self, model: Model, moved: Floats) -> AtRest | Tangent:
         """Tangent stiffness of the elements."""
         if not model.finite:
             return self.rest
-        return Stiffness(elasticity.stiffness(model.quad, self.shear, self.bulk, moved, dtype=np.float32))
+        return Tangent(model.quad, self.shear, self.bulk, moved)
 
     def factor(
-        self, sys: System, matrices: AtRest | Stiffness, slope: Floats | None = None, renew: bool = False
+        self, sys: System, matrices: Matrices, slope: Floats | None = None, renew: bool = False
     ) -> Preconditioner:
         """Factor of the tied stiffness for a set of closed pairs; an old one serves unless renewed."""
         key = sys.closed.tobytes()
@@ -270,9 +270,9 @@ def _step(
     """Newton's step as `_solve` gives it, with at least so much damping, and the damping it took."""
     tangent = body.tangent(start.model, moved)
     while True:
-        matrices = tangent
-        if damping > 0 and isinstance(tangent, Stiffness):
-            matrices = tangent.plus(damping, body.rest)
+        matrices: Matrices = tangent
+        if damping > 0 and isinstance(tangent, Tangent):
+            matrices = tangent.stored.plus(damping, body.rest)
         try:
             return _solve(body, start.model, sys, start.tie, matrices, load, renew), damping
         except (Indefinite, np.linalg.LinAlgError):
@@ -286,7 +286,7 @@ def _solve(
     model: Model,
     sys: System,
     bond: Tie,
-    matrices: AtRest | Stiffness,
+    matrices: Matrices,
     load: Floats,
     renew: bool,
 ) -> tuple[Floats, int, float]:

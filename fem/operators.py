@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,10 +67,40 @@ class Stiffness:
 
 
 @dataclass(frozen=True)
+class Tangent:
+    """Tangent stiffness of deformed elements, in single precision.
+
+    Stored with the first product, which comes after it was factored: the elimination has the memory alone.
+    """
+
+    quad: Quadrature
+    shear: Floats
+    bulk: Floats
+    moved: Floats
+
+    @cached_property
+    def stored(self) -> Stiffness:
+        """All of them."""
+        return Stiffness(self._made(None))
+
+    def __call__(self, elements: Ints) -> NDArray[np.floating]:
+        """Matrices (n, 81, 81) of some elements."""
+        return self.stored(elements) if "stored" in vars(self) else self._made(elements)
+
+    def times(self, local: Floats) -> Floats:
+        """Products with unknowns (elements, 81)."""
+        return self.stored.times(local)
+
+    def _made(self, elements: Ints | None) -> NDArray[np.floating]:
+        shear, bulk = (all_ if elements is None else all_[elements] for all_ in (self.shear, self.bulk))
+        return elasticity.stiffness(self.quad, shear, bulk, self.moved, elements, np.float32)
+
+
+@dataclass(frozen=True)
 class Sheared:
     """Matrices in the unknowns x, y and z - G . (x, y) at each node; slope G (nodes, 2)."""
 
-    matrices: AtRest | Stiffness
+    matrices: Matrices
     cells: Ints
     slope: Floats
 
@@ -87,6 +118,9 @@ class Sheared:
         return found
 
 
-def product(matrices: AtRest | Stiffness, moved: Floats, model: Model) -> Floats:
+Matrices = AtRest | Tangent | Stiffness
+
+
+def product(matrices: Matrices, moved: Floats, model: Model) -> Floats:
     """Forces (m, 27, 3) of element matrices on displacements (nodes, 3)."""
     return matrices.times(moved[model.nodes.cells].reshape(-1, DOFS)).reshape(-1, NODES, 3)

@@ -10,9 +10,9 @@ from scipy.sparse.linalg import LinearOperator, lobpcg
 import fem
 from fem import mesh, solver
 from fem.equilibrium import Body, NotConverged, Preconditioner, State
-from fem.operators import AtRest, Stiffness, product
 from fem.mesh import Geometry
 from fem.meshed import build
+from fem.operators import Matrices, product
 from fem.path import path
 
 Floats = NDArray[np.float64]
@@ -34,7 +34,7 @@ def softest(body: Body, state: State) -> tuple[float, float]:
         change[tip, 2] = bond.height(change)
         return change
 
-    def operator(matrices: AtRest | Stiffness) -> LinearOperator:
+    def operator(matrices: Matrices) -> LinearOperator:
         def apply(values: Floats) -> Floats:
             force = model.nodal(product(matrices, expand(values), model))
             return sys.gather(bond.hand_on(force, force[tip, 2]))
