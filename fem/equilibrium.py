@@ -114,6 +114,8 @@ class Body:
         key = sys.closed.tobytes()
         if renew or key not in self.factors:
             self.factors.clear()  # before the next one: the largest of all memory
+            if isinstance(matrices, Tangent):
+                matrices.let_go()
             made = matrices if slope is None else Sheared(matrices, sys.nodes.cells, slope)
             # a tangent that is not definite in single precision is damped, rather than factored in double
             factor = solver.Factor(sys.tree, made, again=slope is None)

@@ -91,6 +91,10 @@ class Tangent:
         """Products with unknowns (elements, 81)."""
         return self.stored.times(local)
 
+    def let_go(self) -> None:
+        """Keep no matrices, until the next product."""
+        vars(self).pop("stored", None)
+
     def _made(self, elements: Ints | None) -> NDArray[np.floating]:
         shear, bulk = (all_ if elements is None else all_[elements] for all_ in (self.shear, self.bulk))
         return elasticity.stiffness(self.quad, shear, bulk, self.moved, elements, np.float32)
