@@ -128,6 +128,7 @@ def test_more_of_everything_never_hurts(bench: Any) -> None:
         assert (sd(bench(layout(), fewer)) <= one * (1 + 1e-9)).all(), FEW[number]
 
 
+@pytest.mark.slow
 def test_information_adds_over_pictures(bench: Any) -> None:
     both, one, two = (bench(layout(levels)).judged[0].information for levels in ((1.0, 2.0), (1.0,), (2.0,)))
     assert both.fisher == pytest.approx(one.fisher + two.fisher, rel=1e-9)

@@ -36,7 +36,7 @@ FINER = Resolution(arc=2, core=1, shell=2, above=2, below=1, edge=1, side=1, lay
 PLAN = Plan(PROBE, 44.0, ranges=RANGES, resolution=COARSE, fine=FINER, seed=3)
 SLAB = fem.Slab(28.3, 44.0, 5.1)
 INCLUSION = fem.Inclusion(8.2, 5.4, 61.0, (1.1, 0.4))
-SAMPLES = 40
+SAMPLES = 32
 
 
 @pytest.fixture(scope="module")

@@ -130,6 +130,7 @@ def test_a_press_balances(levels: list[fem.Press]) -> None:
         assert answer.mechanics == "finite"
 
 
+@pytest.mark.slow
 def test_levels_on_the_way_are_single_presses(levels: list[fem.Press]) -> None:
     alone = fem.press(PROBE, SLAB, BALL, 2.0, quality="preview", estimate=False)
     assert np.abs(tared(levels[1]) - tared(alone)).max() < 1e-4 * np.abs(tared(alone)).max()

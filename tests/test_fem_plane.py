@@ -201,7 +201,9 @@ def test_answers_are_smooth(kind: Kind) -> None:
         assert np.abs(np.diff(sweep, 2)).max() < 2e-3 * max(sweep)
 
 
-@pytest.mark.parametrize(("size", "depth", "modulus"), [(10, 5, 100), (4, 6, 60)])
+@pytest.mark.parametrize(
+    ("size", "depth", "modulus"), [pytest.param(10, 5, 100, marks=pytest.mark.slow), (4, 6, 60)]
+)
 def test_axisymmetry_agrees_with_three_dimensions(size: float, depth: float, modulus: float) -> None:
     """A disc for the square of equal area: tared maximum within 2 %, total within 3 %, force within 2 %.
 

@@ -47,6 +47,7 @@ def is_tidy(corpus: Path) -> bool:
     return not list(corpus.rglob(".*")) and not (corpus / occupied.LOCK).exists()
 
 
+@pytest.mark.slow
 def test_workers_make_the_bytes_that_one_process_makes(finished_corpus, tmp_path, capfd):
     """Two processes of one thread, from the last to the first, against one process with all its threads."""
     corpus = only_plan(finished_corpus, tmp_path / "c")

@@ -63,6 +63,7 @@ def test_a_level_does_not_depend_on_the_others_beyond_the_solvers_tolerance(desi
     assert off.max() <= 1 and off.mean() < 1e-3  # a count that was about to round the other way
 
 
+@pytest.mark.slow
 def test_the_same_call_gives_the_same_bytes(design, levels):
     again = twin.simulate(design, INCLUSION, [1.0, 2.0], quality="preview", seed=7)
     for frame, other in zip(again, levels, strict=True):
@@ -85,6 +86,7 @@ print(*(hashlib.sha256(array.tobytes()).hexdigest() for array in arrays))
 """
 
 
+@pytest.mark.slow
 def test_one_thread_and_two_give_the_same_bytes():
     found = set()
     for threads in ("1", "2"):

@@ -94,6 +94,7 @@ def test_an_ellipsoid_is_told_and_its_stretch_of_one_is_the_sphere(tilted):
     assert wide.record()["inclusion"]["stretch"] == (1.2, 1.0, 0.8)
 
 
+@pytest.mark.slow
 def test_finite_strain_raises_force_and_signal():
     """At 1 mm the tared signal grows by about 2 %; the two agree as the press goes to zero."""
     design = small()

@@ -184,6 +184,7 @@ def write_again(corpus: Path, place: Path, planes: dict[str, np.ndarray], record
     index.build(corpus, load_plan(corpus), store.sha256(corpus / "plan.json"))
 
 
+@pytest.mark.slow
 def test_pixels_whose_hashes_were_changed_too_are_found_when_made_again(corpus, capsys):
     """One pixel, one part in a thousand, and everything else as if it had always been so."""
     place = corpus / SECOND / "0.exr"
