@@ -118,7 +118,7 @@ def profile(picture: np.ndarray) -> np.ndarray:
 def test_all_light_and_that_of_the_rim_are_the_references(variant: str, name: str) -> None:
     """All of it within 0.5 %, and within 4 % what is seen of the outermost millimetre, where light goes over
     the rim."""
-    standard, runs = pictures(name, 4, 2**15, 3)
+    standard, runs = pictures(name, 4, 2**17, 3)
     for what, off, error, allowed in (
         ("all", *compared(standard.mean(axis=(1, 2)), runs.mean(axis=(1, 2))), 0.5),
         ("rim", *compared(_rim(standard), _rim(runs)), 4.0),
