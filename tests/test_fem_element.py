@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from skfem import Basis, ElementHex2, MeshHex, MeshHex2
 
 from fem import elasticity, solver
+from fem.operators import AtRest, Tangent
 from fem.quadrature import quadrature
 
 Floats = NDArray[np.float64]
@@ -96,3 +97,34 @@ def test_rigid_motion_costs_nothing() -> None:
     for motion in (np.stack([x * 0 + 1, x * 0, x * 0]), np.stack([-y, x, 0 * z]), np.stack([0 * x, -z, y])):
         force = matrices @ motion.T.ravel()[element_dofs(mesh)][:, :, None]
         assert np.abs(force).max() < 1e-11
+
+
+@pytest.mark.parametrize("poisson", [0.3, 0.49, 0.4999])
+def test_forces_at_small_strain_are_the_product_of_the_stiffness(poisson: float) -> None:
+    """Without its matrices, on curved elements of different moduli; and its largest entry is foretold."""
+    mesh = curved_cube(3)
+    quad, rng = quadrature(mesh), np.random.default_rng(0)
+    shear, bulk = elasticity.lame(rng.uniform(1.0, 50.0, quad.size), np.full(quad.size, poisson))
+    matrices = elasticity.stiffness(quad, shear, bulk)
+    rest = AtRest(quad, shear, bulk, np.float64)
+    local = rng.normal(size=(quad.size, 81))
+    expected = np.einsum("nij,nj->ni", matrices, local)
+    np.testing.assert_allclose(rest.times(local), expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+    np.testing.assert_array_equal(rest(np.array([3, 1])), matrices[[3, 1]])
+    assert elasticity.largest(quad, shear, bulk) == pytest.approx(np.abs(matrices).max(), rel=1e-12)
+
+
+def test_tangents_are_the_same_before_and_after_they_are_stored() -> None:
+    mesh = curved_cube(3)
+    quad, rng = quadrature(mesh), np.random.default_rng(1)
+    shear, bulk = elasticity.lame(np.full(quad.size, 5.0), np.full(quad.size, 0.49))
+    moved = 0.01 * rng.normal(size=(mesh.doflocs.shape[1], 3))
+    tangent, some = Tangent(quad, shear, bulk, moved), np.array([2, 5, 11])
+    before, local = tangent(some), rng.normal(size=(quad.size, 81))
+    product = tangent.times(local)
+    scale = np.abs(before).max()
+    np.testing.assert_allclose(tangent(some), before, rtol=0, atol=1e-6 * scale)
+    exact = np.einsum("nij,nj->ni", elasticity.stiffness(quad, shear, bulk, moved), local)
+    np.testing.assert_allclose(product, exact, rtol=0, atol=2e-6 * np.abs(exact).max())
+    tangent.let_go()
+    np.testing.assert_array_equal(tangent(some), before)
