@@ -26,7 +26,7 @@ _LAPACK = {
     np.dtype(np.float64): (lapack.dpotrf, lapack.dtrtri, blas.dtrsm, blas.dsyrk),
 }
 _CHUNK = 128  # element matrices made at a time
-_LARGE = 1 << 21  # entries of what is worth its own memory
+_LARGE = 1 << 19  # entries of what is worth its own memory
 
 
 def factorise(

@@ -78,10 +78,11 @@ class _Background:
     moved: Floats
 
     def unit(self, plan: Plan, point: Floats) -> Floats:
-        """Pressure on plain tissue at small strain, (m, m), per mm and kPa of the tissue."""
+        """Pressure on plain tissue at small strain and the other levels, (levels, m, m), per mm and kPa of
+        the tissue."""
         at = knots(plan)
         weights = np.multiply.outer(lagrange(at[0], 1 / point[4]), lagrange(at[1], float(np.log(point[5]))))
-        return np.asarray(np.tensordot(weights, self.pressure[:, :, 0], 2))
+        return np.asarray(np.tensordot(weights, self.pressure, 2))
 
 
 @dataclass(frozen=True)
@@ -196,7 +197,7 @@ def _cross_validated(known: _Known, fits: _Fits, finer: Regression, solves: Floa
         for i in map(int, np.flatnonzero(fold)):
             guess = again(pairs.inputs[i : i + 1, CENTRED]).reshape(pairs.rise[i].shape)
             whole = fits.samples[0](pairs.inputs[i : i + 1]).reshape(guess.shape)
-            unit = known.base.unit(pairs.plan, pairs.points[i])
+            unit = known.base.unit(pairs.plan, pairs.points[i])[0]
             miss, true = (
                 unit * pairs.on_grid(i, "rise", f, known.base.x) for f in (guess - pairs.rise[i], whole)
             )
@@ -293,7 +294,7 @@ def _errors(known: _Known, fits: _Fits, numbers: NDArray[np.int64]) -> Floats:
         if not len(at):
             continue
         i = int(at[0])
-        unit = base.unit(plan, samples.points[i])
+        unit = base.unit(plan, samples.points[i])[1 if plan.finite else 0 :]
         for k, kind in enumerate(("rise", "tared")):
             true = getattr(samples, kind)[i]
             guess = fits.samples[k](samples.inputs[i : i + 1]).reshape(true.shape)

@@ -220,8 +220,7 @@ def _pressed(
     pressure, displacement = pressure_0, displacement_0
     if added is not None:
         rise, tared = added
-        unit = np.tensordot(weights, emulator.pressure[:, :, 0], 2)
-        pressure = pressure_0 + rise * depth * tissue * unit
+        pressure = pressure_0 * (1 + rise)
         displacement = displacement_0 + depth * tared
     found = {}
     for suffix, p, u in (("", pressure, displacement), ("_0", pressure_0, displacement_0)):

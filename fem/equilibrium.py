@@ -179,7 +179,7 @@ def equilibrium(body: Body, guess: State) -> State:
         overlaps = ~state.closed & (distance < 0)
         if not (pulls.any() or overlaps.any()):
             if settled:
-                return state
+                return replace(state, model=state.model.bare()) if state.model.finite else state
             wanted = np.abs(state.model.wanted(state.moved) - state.model.shift)
             inner = state.model.interface.inner
             change = np.abs(state.force - before) / max(float(np.abs(state.force).max()), 1e-300)

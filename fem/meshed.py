@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,12 +27,22 @@ class Model:
     layout: Layout
     nodes: Nodes
     interface: Interface
-    quad: Quadrature
+    probe: Quadrature  # of the probe's elements, which stay as they are
     place: Floats  # undeformed nodes, (nodes, 3) mm
     shift: Floats  # of the slab's nodes under the probe's, within the slab's surface, (nx, ny, 2) mm
     normal: Floats  # direction of the press in the probe's frame, (3,)
     ball: NDArray[np.int64]  # elements of the inclusion
     finite: bool  # finite strain with sliding contact, or linear elasticity
+
+    @cached_property
+    def quad(self) -> Quadrature:
+        """Of all elements. Made when asked for; an equilibrium lets go of it (`bare`)."""
+        slab = quadrature(self.nodes.cells[: self.nodes.slab_cells], self.place)
+        return join([slab, self.probe])
+
+    def bare(self) -> Model:
+        """The same without what can be made again."""
+        return replace(self)
 
     def chest(self, indentation: float) -> Floats:
         """Displacements that are held, (nodes, 3) mm: the chest wall comes nearer by the indentation."""
@@ -86,14 +97,9 @@ class Model:
 
     def follow(self, shift: Floats) -> Model:
         """The same with the slab's contact nodes at another place within the slab's stress-free surface."""
-        slab = mesh.morph_slab(self.layout, self.geometry, shift)
-        quad, place, cut = quadrature(slab), self.place.copy(), self.nodes.slab_cells
-        place[: self.nodes.slab] = slab.doflocs.T
-        probe = self.quad.part(np.arange(cut, self.quad.size))
-        fields = (
-            np.concatenate([getattr(quad, f), getattr(probe, f)]) for f in ("inverse", "weight", "modes")
-        )
-        return replace(self, quad=Quadrature(self.quad.nodes, *fields), place=place, shift=shift)
+        place = self.place.copy()
+        place[: self.nodes.slab] = mesh.morph_slab(self.layout, self.geometry, shift).doflocs.T
+        return replace(self, place=place, shift=shift)
 
 
 def build(geometry: Geometry, res: Resolution, finite: bool) -> Model:
@@ -108,7 +114,7 @@ def build(geometry: Geometry, res: Resolution, finite: bool) -> Model:
         layout,
         found,
         Interface(found.contact, found.tip, (recovery(x), recovery(y)), layout.symmetric),
-        join([quadrature(slab), quadrature(probe)]),
+        quadrature(found.cells[found.slab_cells :], place),
         place,
         np.zeros((*found.tip.shape, 2)),
         mesh.rotation(geometry.pose.tilt_deg).T[:, 2],

@@ -3,11 +3,11 @@ modes."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
-from skfem import ElementHex2, MeshHex2
+from skfem import ElementHex2
 from skfem.quadrature import get_quadrature
 
 Floats = NDArray[np.float64]
@@ -53,9 +53,7 @@ class Quadrature:
 
     def part(self, elements: Ints) -> Quadrature:
         """The same for some of the elements."""
-        return Quadrature(
-            self.nodes[elements], self.inverse[elements], self.weight[elements], self.modes[elements]
-        )
+        return Quadrature(*(getattr(self, f.name)[elements] for f in fields(self)))
 
     @property
     def size(self) -> int:
@@ -63,10 +61,9 @@ class Quadrature:
         return len(self.weight)
 
 
-def quadrature(mesh: MeshHex2) -> Quadrature:
-    """Prepare the elements of a mesh of curved hexahedra, mm."""
-    nodes = mesh.dofs.element_dofs.T.astype(np.int64)
-    place = mesh.doflocs.T[nodes]  # (m, 27, 3)
+def quadrature(nodes: Ints, points: Floats) -> Quadrature:
+    """Prepare curved hexahedra: nodes (m, 27) of each, and where they are, (nodes, 3) mm."""
+    place = points[nodes]
     # jacobian[q, a, b] = d x_a / d xi_b
     jacobian = np.einsum("mia,ibq->mqab", place, _REFERENCE, optimize=True)
     determinant = np.linalg.det(jacobian)
@@ -82,12 +79,5 @@ def quadrature(mesh: MeshHex2) -> Quadrature:
 
 
 def join(parts: list[Quadrature]) -> Quadrature:
-    """Bodies side by side; nodes of the later ones count on from those of the earlier ones."""
-    start, nodes = 0, []
-    for part in parts:
-        nodes.append(part.nodes + start)
-        start += int(part.nodes.max()) + 1
-    return Quadrature(
-        np.concatenate(nodes),
-        *(np.concatenate([getattr(p, name) for p in parts]) for name in ("inverse", "weight", "modes")),
-    )
+    """All elements of several together."""
+    return Quadrature(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Quadrature)))

@@ -9,9 +9,9 @@ is learned apart, as the difference that it makes on a coarse mesh, from fewer s
 each. All press levels lie on one way down; between them and small strain, which is level 0, the answers per
 mm are a polynomial in the indentation.
 
-Contact pressures are kept as their *rise* over the tissue without inclusion, on the same mesh: next to the
-probe's edge both follow the same singularity, and so does their discretisation error. In the rise both
-cancel.
+Contact pressures are kept as their *rise* over the tissue without inclusion, on the same mesh and at the same
+level: next to the probe's edge both follow the same singularity, and so does their discretisation error. In
+the rise both cancel.
 """
 
 from __future__ import annotations
@@ -253,7 +253,7 @@ def stretch(plan: Plan, point: Floats) -> dict[str, Floats]:
     Returns
     -------
     `rise` (levels, k, k) and `moved` (levels, k, k, 3) as of `solve`, finite minus small strain, for the
-    levels but 0; the rise is in units of the pressure without inclusion at small strain.
+    levels but 0.
 
     Raises
     ------
@@ -266,24 +266,17 @@ def stretch(plan: Plan, point: Floats) -> dict[str, Floats]:
         model = build(geometry, res, False)
         bare = path(geometry, model, False)
         small = _tared(geometry, path(geometry, model, True, bare), bare, 1.0)
-        state = bare.to(1.0)
-        unit = _fields(geometry, (state, state))[0]
         model = build(geometry, res, True)
         bare = path(geometry, model, False)
         full = path(geometry, model, True, bare)
-        found = [_tared(geometry, full, bare, float(level), unit) for level in plan.levels[1:]]
+        found = [_tared(geometry, full, bare, float(level)) for level in plan.levels[1:]]
     return {name: np.stack([f[k] - small[k] for f in found]) for k, name in enumerate(("rise", "moved"))}
 
 
-def _tared(
-    geometry: Geometry, full: Path, bare: Path, level: float, unit: Floats | None = None
-) -> tuple[Floats, Floats]:
-    """Rise (n, n) over `unit` kPa / mm, by default the bare pressure itself, and tared displacement (n, n,
-    3), both per mm of the level, mm."""
-    other = bare.to(level)
-    pressure, moved, pressure_0, moved_0 = _fields(geometry, (full.to(level), other))
-    scale = pressure_0 if unit is None else unit * level
-    return (pressure - pressure_0) / scale, (moved - moved_0) / level
+def _tared(geometry: Geometry, full: Path, bare: Path, level: float) -> tuple[Floats, Floats]:
+    """Rise (n, n) and tared displacement (n, n, 3) per mm of the level, mm."""
+    pressure, moved, pressure_0, moved_0 = _fields(geometry, (full.to(level), bare.to(level)))
+    return (pressure - pressure_0) / pressure_0, (moved - moved_0) / level
 
 
 def background(plan: Plan, thickness: float, tissue: float) -> dict[str, Floats]:

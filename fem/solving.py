@@ -3,6 +3,7 @@ on."""
 
 from __future__ import annotations
 
+import json
 import multiprocessing
 import os
 import signal
@@ -27,6 +28,7 @@ class NotBuilt(ValueError):
     """An emulator that cannot be built from what there is: one line says why."""
 
 
+_FORMAT = 2  # of the files in a folder
 SHARE = 8  # samples for each pair of a fine and a lean mesh
 STRETCHED = 3  # samples for each one at finite strain, which is the same specimen as an earlier one
 _FIRST = 16  # pairs that come with one sample each
@@ -100,18 +102,19 @@ def run(
 def claim(plan: Plan, folder: Path) -> None:
     """Write the plan into an empty folder, or check that it is the folder's own."""
     folder.mkdir(parents=True, exist_ok=True)
-    text, place = PLAN.dump_json(plan, indent=1), folder / "plan.json"
+    head, place = {"format": _FORMAT, "plan": PLAN.dump_python(plan, mode="json")}, folder / "plan.json"
     if place.exists():
         try:
-            same = PLAN.validate_json(place.read_bytes()) == plan
+            same = json.loads(place.read_bytes()) == json.loads(json.dumps(head))
         except ValueError:
             same = False
         if not same:
             raise NotBuilt(
-                f"folder: received {folder}, which holds the samples of another plan; allowed an empty one"
+                f"folder: received {folder}, which holds the samples of another plan, or of another version; "
+                "allowed an empty one"
             )
     else:
-        _write(place, text)
+        _write(place, json.dumps(head, indent=1).encode())
 
 
 def _tasks(plan: Plan, folder: Path, samples: int | None) -> Iterator[tuple[str, int]]:

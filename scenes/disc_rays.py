@@ -161,8 +161,9 @@ def arrives(
     steps: int,
 ) -> tuple[mi.Float, tuple[mi.Float, ...], mi.Vector2f]:
     """Irradiance, W/mm², at the targets from one point of each disc; the cosine of incidence there and the
-    direction along x and y; and what the ray's slopes will be from the next point, so far ``onwards``. They
-    are found in so many steps of Newton's method from what the point before foretold."""
+    direction's part along the surface, in x and y; and what the ray's slopes will be from the next point, so
+    far ``onwards``. They are found in so many steps of Newton's method from what the point before foretold.
+    """
     slope_x, slope_y = here[3:]
     guide, glass = sensor.guide, sensor.glass
     half, layers, floors = guide.width_mm / 2, guide.layers, guide.floors_mm
@@ -209,7 +210,9 @@ def arrives(
     d_x = path.p_x * source.axis_x + path.p_y * dr.abs(source.axis_y)
     d_y = path.p_x * source.axis_y + path.p_y * dr.abs(source.axis_x)
     facing = p_up - d_x * slope_x - d_y * slope_y
-    cosine = facing * dr.rsqrt(1.0 + dr.square(slope_x) + dr.square(slope_y)) / guide.refractive_index
+    steep = dr.rcp(1.0 + dr.square(slope_x) + dr.square(slope_y))
+    cosine = facing * dr.sqrt(steep) / guide.refractive_index
+    d_x, d_y = d_x + facing * steep * slope_x, d_y + facing * steep * slope_y
     flux = source.density * path.etendue * share * facing / p_up
     if not source.patterns.lambertian:
         leaving = dr.sqrt(dr.maximum(1.0 - tangential2 / dr.square(source.index), 0.0))

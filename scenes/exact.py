@@ -144,7 +144,7 @@ def exact(
     sensor: Sensor,
     table: Table,
     rays: PixelRays,
-    fraction: Array,
+    ground: transport.Ground,
     samples: int,
     seed: int,
     *,
@@ -160,8 +160,8 @@ def exact(
     ----------
     scene
         From `build.load_scene`, with its surface put in place.
-    fraction
-        Real contact fraction (m, m) on cells [iy, ix] of the deformed surface over the guide's face.
+    ground
+        The deformed surface over the guide's face, from `transport.survey`.
     samples
         Light paths per LED.
     local
@@ -171,8 +171,8 @@ def exact(
         Radiance (n_led, rows, columns) of `local.straight`: paths that it has are then left out of what is
         seen directly, and it takes their place, without noise. Only with `local`.
     slopes
-        Derivatives of `fraction` to q parameters, (q, m, m): what is seen is followed by its derivatives, by
-        the paths' scores (`wander.Spots`). Not with `local`.
+        Derivatives of `ground.fraction` to q parameters, (q, m, m): what is seen is followed by its
+        derivatives, by the paths' scores (`wander.Spots`). Not with `local`.
     place
         Centre (3,) and axes (3, 3), mm, of an ellipsoid of `sensor.inclusion` in the tissue (`wander.Lump`).
     tally
@@ -195,7 +195,8 @@ def exact(
     views = [_View.of(film, sensor, 1 + per.size) for film in films]
     contact = next(shape for shape in scene.shapes() if shape.id() == "contact")
     faces = Faces(scene, sensor)
-    spots = wander.Spots.of(sensor, fraction, even)
+    spots = wander.Spots.of(sensor, ground.fraction, even)
+    relief = wander.Relief.on(ground.height_mm, sensor.guide.width_mm)
     lump = None if place is None else wander.Lump.of(sensor, place)
     least = sensor.guide.under_contact_mm(1.0)
     squeezed = (sensor.guide.refractive_index / sensor.tissue.refractive_index) ** 2
@@ -252,7 +253,7 @@ def exact(
                 one + dr.select(touches, new, 0.0) for one, new in zip(scores, chosen, strict=True)
             )
             back, left, random, scores = wander.wander(
-                sensor, table, spots, views, met, number, throughput, enters, random, scores, lump
+                sensor, table, spots, relief, views, met, number, throughput, enters, random, scores, lump
             )
             share = dr.select(enters, left, share)
             following = dr.select(enters, _come_back(scene, contact, back, least), following)
@@ -326,8 +327,8 @@ def _scattered(
 
 
 def _come_back(scene: mi.Scene, contact: mi.Shape, ray: mi.Ray3f, least: float) -> mi.Ray3f:
-    """A ray that leaves the tissue, from the surface itself: tissue is flat only over a spot of light. It is
-    looked for from a height that is at least this."""
+    """A ray that leaves the tissue, from the mesh itself. It is looked for from a height that is at least
+    this."""
     start = dr.maximum(ray.o.z - _BELOW_MM, least)
     below = mi.Ray3f(mi.Point3f(ray.o.x, ray.o.y, start), mi.Vector3f(0.0, 0.0, 1.0))
     si = scene.ray_intersect(below)

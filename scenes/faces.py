@@ -57,6 +57,11 @@ class Meeting:
     fraction: mi.Float
 
     @property
+    def along(self) -> mi.Vector3f:
+        """Part of the direction along the face."""
+        return self.d + self.cosine * self.normal
+
+    @property
     def mirrored(self) -> mi.Vector3f:
         """Direction after reflection."""
         return self.d + 2.0 * self.cosine * self.normal
@@ -129,8 +134,8 @@ class Faces:
     def polished(self, meeting: Meeting, sample: mi.Float) -> mi.Vector3f:
         """Direction after a flat dielectric face: mirrored with Fresnel's share as chance, else refracted."""
         mirrored, cosine, _, squeeze = mi.fresnel(meeting.cosine, self.eta(meeting))
-        along = meeting.d + meeting.cosine * meeting.normal
-        return dr.select(sample <= mirrored, meeting.mirrored, squeeze * along + cosine * meeting.normal)
+        through = squeeze * meeting.along + cosine * meeting.normal
+        return dr.select(sample <= mirrored, meeting.mirrored, through)
 
 
 def _in_fours(buffer: mi.Float, width: int, last: mi.Float | None = None) -> mi.Float:

@@ -127,7 +127,9 @@ def glance(scene: mi.Scene, sensor: Sensor, table: Table, coupling: Coupling, ra
             lean = direction - dr.dot(direction, si.sh_frame.n) * si.sh_frame.n
         fraction = dr.select(seen, contact.eval_attribute_1("vertex_contact_fraction", si, seen), 0.0)
         transmitted = table.transmittance(fraction, cosine, seen)
-        emitted = dr.select(seen, gain * transmitted * (coupling.scale * dr.inv_pi), 0.0)
+        # light is told per area of the map, the slope has more
+        upright = dr.abs(si.sh_frame.n.z)
+        emitted = dr.select(seen, gain * transmitted * upright * (coupling.scale * dr.inv_pi), 0.0)
         points.append((si.p.x / guide.width_mm + 0.5, si.p.y / guide.width_mm + 0.5, emitted))
         # mirrored in the contact surface, down, mirrored in the lower faces, up again; the slope left out
         gain = dr.select(seen, gain * (1.0 - transmitted), 0.0)

@@ -297,7 +297,7 @@ def _on_cells(renderer: Renderer, pressed: OpticalSurface, move: _Moves) -> Arra
     step = dr.opaque(mi.Float, 0.0)
     dr.enable_grad(step)
     _hang(renderer, pressed, move, step)
-    fraction, _ = transport.glance(renderer.scene, renderer.sensor)
+    fraction, _, _ = transport.glance(renderer.scene, renderer.sensor)
     dr.forward(step)
     found = np.asarray(dr.grad(fraction)).astype(np.float64)
     build.put_surface(renderer.scene, renderer.sensor, pressed)

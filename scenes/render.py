@@ -277,8 +277,8 @@ class Renderer:
 
         tally = housing.Tally(self.sensor) if self.sensor.housing.reflects else None
         flux = np.array([led.flux_W for led in self.sensor.leds])
-        fraction = transport.survey(self.scene, self.sensor).fraction
-        parts = (self.scene, self.sensor, self.table, self.rays, fraction, samples)
+        ground = transport.survey(self.scene, self.sensor)
+        parts = (self.scene, self.sensor, self.table, self.rays, ground, samples)
         total: Array | float = 0.0
 
         def passes() -> Iterator[Array]:

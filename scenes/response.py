@@ -200,13 +200,13 @@ class Response:
 
     def _entering(self, landed: Landed, number: int, only: int | None = None) -> Array:
         """`irradiance.transmitted` of one LED's light and its derivatives, (1 + q, functions, m, m)."""
-        entrance, meets = self.under.entrance, self.under.ground.meets
+        entrance, counts = self.under.entrance, self.under.counts
         light = landed.light[number : number + 1]
         lights = np.concatenate([light[:, : entrance.basis.layers], landed.slopes[:, number]])
-        found = transmitted(entrance, lights * meets, only).astype(np.float64)
+        found = transmitted(entrance, lights * counts, only).astype(np.float64)
         for one, change in zip(found[1:], self.changes, strict=True):
             for steep, layers in change.entrances:
-                one += transmitted(steep, light[:, layers] * meets, only)[0]
+                one += transmitted(steep, light[:, layers] * counts, only)[0]
         return found
 
     def _solved(self, entering: Array, tolerance: float, straight: Array | None = None) -> Array:

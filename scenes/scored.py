@@ -67,12 +67,14 @@ def scored(
     """
     parts = renderer.scene, renderer.sensor, renderer.table
     looks = [_look(renderer, in_place(shape, one)) for one in slopes]
-    fraction, windows, lamps = middle = _look(renderer, shape)
+    middle = _look(renderer, shape)
     by_fraction, by_windows, by_lamps = (
         np.stack([(one[k] - middle[k]) / slope.step for one, slope in zip(looks, slopes, strict=True)])
         for k in range(3)
     )
-    seen = exact.exact(*parts, renderer.rays, fraction, samples, seed, slopes=by_fraction)
+    _, windows, lamps = middle
+    ground = transport.survey(renderer.scene, renderer.sensor)
+    seen = exact.exact(*parts, renderer.rays, ground, samples, seed, slopes=by_fraction)
     picture = np.einsum("snyx,syx->nyx", seen[0], windows) + lamps
     answers = np.einsum("qsnyx,syx->qnyx", seen[1:], windows)
     answers += np.einsum("snyx,qsyx->qnyx", seen[0], by_windows) + by_lamps

@@ -116,7 +116,7 @@ def walk(
         column = mi.UInt32(dr.clip((met.p.x / width + 0.5) * CELLS, 0.0, CELLS - 1.0))
         row = mi.UInt32(dr.clip((met.p.y / width + 0.5) * CELLS, 0.0, CELLS - 1.0))
         cell = ((number * CELLS + row) * CELLS + column) * count
-        counted = [*weights.at(cosine, ray.d.x, ray.d.y, lands), through]
+        counted = [*weights.at(cosine, met.along.x, met.along.y, lands), through]
         for where, irradiance in zip(maps, (throughput, alike), strict=True):
             for k, weight in enumerate(counted):
                 amount = mi.Int64(dr.round(irradiance * weight * _FIXED_POINT))

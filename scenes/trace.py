@@ -140,7 +140,7 @@ def walk(
         column = mi.UInt32(dr.clip((met.p.x / width + 0.5) * CELLS, 0.0, CELLS - 1.0))
         row = mi.UInt32(dr.clip((met.p.y / width + 0.5) * CELLS, 0.0, CELLS - 1.0))
         cell = ((number * CELLS + row) * CELLS + column) * many  # layers side by side: one place in memory
-        weighed = [throughput * weight for weight in weights.at(cosine, ray.d.x, ray.d.y, lands)]
+        weighed = [throughput * weight for weight in weights.at(cosine, met.along.x, met.along.y, lands)]
         for k, amount in enumerate(weighed):
             dr.scatter_add(maps, mi.Int64(dr.round(amount * _FIXED_POINT)), cell + k, lands)
         if scores:

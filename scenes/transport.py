@@ -13,10 +13,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 
 from . import housing, recurrence, trace
 from .abreast import abreast
 from .arrays import floats, numbers
+from .bent import Bent, bent
 from .bsdf import Table
 from .gather import meet
 from .irradiance import AngularBasis, Entrance, smooth, transmitted
@@ -48,6 +50,7 @@ class Behind:
     coupling: Coupling
     passage: Passage
     spread: Spread
+    bent: Bent
     coarse: Behind | None
 
     @staticmethod
@@ -59,7 +62,7 @@ class Behind:
         first = passage(coupling, width, cells, margin)
         spread = spreader(body, coupling, width * wide / cells, wide)
         coarse = Behind.of(sensor, coupling, trace.CELLS) if cells > trace.CELLS else None
-        return Behind(coupling, first, spread, coarse)
+        return Behind(coupling, first, spread, bent(body, width, cells), coarse)
 
 
 @dataclass(frozen=True)
@@ -72,14 +75,17 @@ class Ground:
         Real contact fraction of the deformed surface there; 0 beside the surface.
     meets : (m, m), single precision
         Share of the cell in which the surface lies.
+    height_mm : (m, m)
+        Of the surface, as of its nearest point where there is none.
     """
 
     fraction: Array
     meets: Singles
+    height_mm: Array
 
     def coarser(self) -> Ground:
         """On the cells that walks are counted on."""
-        return Ground(self.on_coarser(self.fraction), coarser(self.meets))
+        return Ground(self.on_coarser(self.fraction), coarser(self.meets), coarser(self.height_mm))
 
     def on_coarser(self, values: Array) -> Array:
         """Means (..., trace.CELLS, trace.CELLS) of values (..., m, m) over the surface within those cells."""
@@ -118,11 +124,14 @@ class Light:
 
 def survey(scene: mi.Scene, sensor: Sensor) -> Ground:
     """Look at the deformed surface from below, cell by cell."""
-    found = [np.asarray(values).reshape(GRID, GRID) for values in glance(scene, sensor)]
-    return Ground(found[0].astype(np.float64), found[1].astype(np.float32))
+    fraction, meets, height = (np.asarray(v).reshape(GRID, GRID) for v in glance(scene, sensor))
+    if not meets.all():  # a rim that is drawn in
+        near = distance_transform_edt(~meets, return_distances=False, return_indices=True)
+        height = height[tuple(near)]
+    return Ground(fraction.astype(np.float64), meets.astype(np.float32), height.astype(np.float64))
 
 
-def glance(scene: mi.Scene, sensor: Sensor) -> tuple[mi.Float, mi.Bool]:
+def glance(scene: mi.Scene, sensor: Sensor) -> tuple[mi.Float, mi.Bool, mi.Float]:
     """The same on the device, cell after cell: Dr.Jit differentiates it to the scene's surface."""
     width = sensor.guide.width_mm
     middles = (np.arange(GRID) + 0.5) / GRID * width - width / 2
@@ -132,7 +141,7 @@ def glance(scene: mi.Scene, sensor: Sensor) -> tuple[mi.Float, mi.Bool]:
     si = meet(scene, mi.ShapePtr(contact), mi.Point3f(x, y, height), mi.Vector3f(0.0, 0.0, 1.0))
     meets = si.is_valid() & (si.shape == mi.ShapePtr(contact))
     fraction = dr.select(meets, contact.eval_attribute_1("vertex_contact_fraction", si, meets), 0.0)
-    return fraction, meets
+    return fraction, meets, si.p.z
 
 
 def transport(
@@ -247,12 +256,16 @@ class Under:
     ground: Ground
     bed: Bed
     face: Face
+    counts: Singles  # share of a cell's light that comes to the surface, and how that answers light: (m, m)
 
     @staticmethod
     def at(basis: AngularBasis, behind: Behind, ground: Ground) -> Under:
         fraction = np.pad(ground.fraction, behind.passage.margin, constant_values=np.nan)
         entrance, face = Entrance.at(basis, ground.fraction), behind.passage.face(fraction)
-        return Under(entrance, behind, ground, behind.spread.on(fraction), face)
+        bed, inside = behind.spread.on(fraction), slice(behind.passage.margin, -behind.passage.margin)
+        thrown = behind.spread.free + float(bed.excess[inside, inside].mean())
+        counts = (ground.meets * behind.bent.on(ground.height_mm, thrown)).astype(np.float32)
+        return Under(entrance, behind, ground, bed, face, counts)
 
     @cached_property
     def coarser(self) -> Under:
@@ -265,7 +278,7 @@ class Under:
         sides: enough for light that has been in the tissue before."""
 
         def one(number: int) -> Array:
-            some = landed[number : number + 1] * self.ground.meets
+            some = landed[number : number + 1] * self.counts
             return self._upward(transmitted(self.entrance, some, self._modes), 1e-3)[0]
 
         return np.concatenate(abreast(one, len(landed)))
@@ -274,7 +287,7 @@ class Under:
         """The same, ahead of where it went in."""
 
         def one(number: int) -> Array:
-            entering = transmitted(self.entrance, landed[number : number + 1] * self.ground.meets)
+            entering = transmitted(self.entrance, landed[number : number + 1] * self.counts)
             straight = self.behind.passage.enter(entering, glimpse=False)[0]
             return self._upward(entering[:, : self._modes], 1e-3, straight)[0]
 
@@ -290,7 +303,7 @@ class Under:
         passage = self.behind.passage
 
         def one(number: int) -> Seen:
-            entering = transmitted(self.entrance, landed[number : number + 1] * self.ground.meets)
+            entering = transmitted(self.entrance, landed[number : number + 1] * self.counts)
             straight, glimpse = passage.enter(entering)
             _, upward = self._upward(entering[:, : self._modes], 1e-6, straight)
             further, again = passage.thrown_back(upward, self.face)

@@ -53,6 +53,13 @@ class Medium:
         return self.scattering_per_mm + self.absorption_per_mm
 
 
+class Face(Protocol):
+    """A face that is not flat; the body lies on its +z side."""
+
+    def at(self, point: mi.Point3f) -> tuple[mi.Float, mi.Vector3f]:
+        """Depth of points below the face, mm, and its normal there, into the body."""
+
+
 class Inclusion(Protocol):
     """A part of the body that is another medium, of the same refractive index."""
 
@@ -80,12 +87,13 @@ class Ball:
 @dataclass(frozen=True)
 class Body:
     """What light walks in: a half-space, or a slab in front of a Lambertian backing; another medium may be in
-    it."""
+    it, and its face may be bent, little over a free path."""
 
     medium: Medium
     thickness_mm: float = np.inf
     backing: float = 0.0
     ball: Inclusion | None = None
+    face: Face | None = None
 
 
 @dataclass(frozen=True)
@@ -211,22 +219,30 @@ def roam(
         kept_in, real_in, g_in = (dr.opaque(mi.Float, v) for v in _collision(ball.medium, majorant))
     isotropic = medium.anisotropy == 0.0 and (ball is None or ball.medium.anisotropy == 0.0)
 
+    def lies(point: mi.Point3f) -> tuple[mi.Float, mi.Vector3f]:
+        """Depth, and the face's normal."""
+        return (point.z, mi.Vector3f(0.0, 0.0, 1.0)) if body.face is None else body.face.at(point)
+
     def going(where, direction, weight, through, alive, step, random, *scores):  # type: ignore[no-untyped-def]
         return alive
 
     def on(where, direction, weight, through, alive, step, random, *scores):  # type: ignore[no-untyped-def]
-        up = direction.z < 0.0
+        depth, normal = lies(where)
+        sinks = dr.dot(direction, normal)
+        up = sinks < 0.0
         free = -dr.log(1.0 - random.next_float32()) * longest
-        face = dr.select(up, -where.z, bottom - where.z) / direction.z
-        face = dr.select(direction.z == 0.0, dr.inf, face)
+        face = dr.select(up, -depth, bottom - depth) / sinks
+        face = dr.select(sinks == 0.0, dr.inf, face)
         meets = free >= face
         ahead = where + dr.minimum(free, face) * direction
         at_face, at_bottom = meets & up, meets & ~up
-        depth = dr.select(at_face, 0.0, dr.select(at_bottom, bottom, dr.maximum(ahead.z, 0.0)))
-        where = mi.Point3f(ahead.x, ahead.y, depth)
+        now, normal = lies(ahead)
+        depth = dr.select(at_face, 0.0, dr.select(at_bottom, bottom, dr.maximum(now, 0.0)))
+        where = mi.Point3f(ahead.x, ahead.y, ahead.z + (depth - now) / normal.z)
+        sinks = dr.dot(direction, normal)
 
         u1, u2, u3 = (random.next_float32() for _ in range(3))
-        leaves = at_face & (u3 < passing(where, -direction.z))
+        leaves = at_face & (u3 < passing(where, -sinks))
         through = through + dr.select(alive & at_bottom, weight * (1.0 - body.backing), 0.0)
         weight = dr.select(at_bottom, weight * body.backing, weight)
 
@@ -241,12 +257,14 @@ def roam(
         if witness is not None:
             witness(where, direction, weight, mean, alive & collides, scores)
         if scoring is not None:
-            more = scoring(where, -direction.z, leaves, alive & at_face)
+            more = scoring(where, -sinks, leaves, alive & at_face)
             scores = tuple(one + new for one, new in zip(scores, more, strict=True))
         turned = mi.Frame3f(direction).to_world(_scattered(mean, u1, u2, isotropic))
         thrown = mi.warp.square_to_cosine_hemisphere(mi.Point2f(u1, u2))
         lambert = mi.Vector3f(thrown.x, thrown.y, -dr.maximum(thrown.z, 1e-6))
-        mirrored = mi.Vector3f(direction.x, direction.y, dr.abs(direction.z))
+        mirrored = direction + (dr.abs(sinks) - sinks) * normal
+        if body.face is not None:
+            lambert = mi.Frame3f(normal).to_world(lambert)
         following = dr.select(collides, turned, dr.select(at_bottom, lambert, direction))
         following = dr.select(at_face & ~leaves, mirrored, following)
         direction = mi.Vector3f(dr.select(alive, dr.normalize(following), direction))

@@ -1,14 +1,12 @@
 """One visit of light to the tissue, as a volume: in through the contact, scattered, out again or absorbed.
 
-The contact surface is taken for flat over the width of a spot of light, a millimetre or two.
-
 Import only after a variant is set (`scenes.backend.use`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import drjit as dr
@@ -118,6 +116,10 @@ class Lump:
         rows = [[dr.opaque(mi.Float, float(one)) for one in row] for row in np.linalg.inv(axes)]
         return Lump(medium_of(sensor.inclusion.of(sensor.tissue)), middle, mi.Matrix3f(rows))
 
+    def holds(self, point: mi.Point3f) -> mi.Bool:
+        """Which points are in it."""
+        return dr.squared_norm(self.unit(point)) < 1.0
+
     def unit(self, point: mi.Point3f) -> mi.Vector3f:
         """A point where the lump is the unit ball."""
         return self.inverse @ mi.Vector3f(point - self.centre_mm)
@@ -134,18 +136,36 @@ class Lump:
 
 
 @dataclass(frozen=True)
-class Below:
-    """A lump as it lies under one point of the contact, in the frame that light walks in there."""
+class Relief:
+    """The contact surface as light in the tissue meets it: height, mm, and slopes along x and y, on a grid
+    over the guide's face; beyond, it goes on straight."""
 
-    lump: Lump
-    world: Callable[[mi.Point3f], mi.Point3f]
+    maps: mi.Texture2f
+    width_mm: float
+    last_mm: float  # middle of the grid's last cell
 
-    @property
-    def medium(self) -> Medium:
-        return self.lump.medium
+    @staticmethod
+    def on(height: NDArray[np.float64], width_mm: float) -> Relief:
+        """From heights at the middles of cells [iy, ix], (m, m) mm."""
+        middles = (np.arange(len(height)) + 0.5) / len(height) * width_mm - width_mm / 2
+        slope_y, slope_x = np.gradient(height, middles, middles)
+        stacked = np.stack([height, slope_x, slope_y], axis=-1).astype(np.float32)
+        maps = mi.Texture2f(mi.TensorXf(stacked), wrap_mode=dr.WrapMode.Clamp)
+        return Relief(maps, width_mm, float(middles[-1]))
 
-    def holds(self, point: mi.Point3f) -> mi.Bool:
-        return dr.squared_norm(self.lump.unit(self.world(point))) < 1.0
+    def at(self, point: mi.Point3f) -> tuple[mi.Float, mi.Vector3f]:
+        """Depth of points in the tissue, mm, and the normal above which they lie, into it."""
+        last, width = self.last_mm, self.width_mm
+        x, y = (dr.clip(at, -last, last) for at in (point.x, point.y))
+        height, slope_x, slope_y = self.maps.eval(mi.Point2f(x / width + 0.5, y / width + 0.5))
+        height += (point.x - x) * slope_x + (point.y - y) * slope_y
+        normal = dr.normalize(mi.Vector3f(-slope_x, -slope_y, 1.0))
+        return (point.z - height) * normal.z, normal
+
+    def onto(self, point: mi.Point3f) -> tuple[mi.Point3f, mi.Vector3f]:
+        """The points of the surface over or under points near it, and the normals there."""
+        depth, normal = self.at(point)
+        return mi.Point3f(point.x, point.y, point.z - depth / normal.z), normal
 
 
 def medium_of(tissue: Tissue) -> Medium:
@@ -154,20 +174,21 @@ def medium_of(tissue: Tissue) -> Medium:
     return Medium(tissue.scattering_per_mm / (1.0 - g), tissue.absorption_per_mm, g)
 
 
-def body_of(sensor: Sensor) -> Body:
+def body_of(sensor: Sensor, relief: Relief | None = None, lump: Lump | None = None) -> Body:
     """What light enters: the tissue, or the contact sheet before it."""
     skin = sensor.skin
     if skin.sheet is None:
-        return Body(medium_of(sensor.tissue))
+        return Body(medium_of(sensor.tissue), ball=lump, face=relief)
     sheet = skin.sheet
     medium = Medium(sheet.scattering_per_mm, sheet.absorption_per_mm)
-    return Body(medium, sheet.thickness_mm, sheet.backing)
+    return Body(medium, sheet.thickness_mm, sheet.backing, ball=lump, face=relief)
 
 
 def wander(
     sensor: Sensor,
     table: Table,
     spots: Spots,
+    relief: Relief,
     views: Sequence[View],
     met: Meeting,
     number: mi.UInt32,
@@ -179,74 +200,67 @@ def wander(
 ) -> tuple[mi.Ray3f, mi.Float, mi.PCG32, Scores]:
     """Follow light that enters where it `met` the contact until it leaves; views see every collision.
 
-    A lump lies where it is in space: only the face over it is flat.
-
     Returns
     -------
-    The ray that leaves (in the guide, from the plane through there), the share of the light that it carries,
+    The ray that leaves (in the guide, from the relief), the share of the light that it carries,
     0 where all is absorbed, the state of the random numbers, and the scores that `scores` grew to.
     """
-    body = body_of(sensor)
+    body = body_of(sensor, relief, lump)
     index = sensor.guide.refractive_index / behind(sensor)
     bare = fresnel(behind(sensor), 1.0)
-    frame = mi.Frame3f(met.normal)
-    here = frame.to_local(met.d)
-
-    def world(place: mi.Point3f) -> mi.Point3f:
-        return met.p + frame.to_world(mi.Vector3f(place.x, place.y, -place.z))
-
     extinction, more = body.medium.extinction_per_mm, 0.0
     if lump is not None:
-        body = replace(body, ball=Below(lump, world))
         more = lump.medium.extinction_per_mm - extinction
 
     def steep(where: mi.Point3f, cosine: mi.Float) -> tuple[mi.Float, mi.Float]:
-        square, place = 1.0 - (1.0 - dr.square(cosine)) / index**2, world(where)
-        found = table.steep(spots.at(place), dr.safe_sqrt(square))
+        square = 1.0 - (1.0 - dr.square(cosine)) / index**2
+        found = table.steep(spots.at(where), dr.safe_sqrt(square))
         touched = tuple(dr.select(square > 0.0, one, 0.0) for one in found)
-        covered, free = spots.covers(place), (bare(place, cosine), 0.0)
+        covered, free = spots.covers(where), (bare(where, cosine), 0.0)
         return tuple(dr.select(covered, one, other) for one, other in zip(touched, free, strict=True))
 
     def passing(where: mi.Point3f, cosine: mi.Float) -> mi.Float:
         return steep(where, cosine)[0]
 
     def scoring(where: mi.Point3f, cosine: mi.Float, leaves: mi.Bool, meets: mi.Bool) -> Scores:
-        added = spots.scores(world(where), *steep(where, cosine), leaves)
+        added = spots.scores(where, *steep(where, cosine), leaves)
         return tuple(dr.select(meets, one, 0.0) for one in added)
 
     def witness(
         where: mi.Point3f, way: mi.Vector3f, share: mi.Float, g: mi.Float, collides: mi.Bool, so_far: Scores
     ) -> None:
+        depth, normal = relief.at(where)
         for view in views:
-            down = view.towards(world(where))
+            down = view.towards(where)
             length = dr.norm(down)
-            out = frame.to_local(down) / length
-            aim_x, aim_y = out.x * index, out.y * index
-            up = dr.safe_sqrt(1.0 - dr.square(aim_x) - dr.square(aim_y))
-            run = where.z / dr.maximum(up, 1e-6)
-            leaves = world(where + run * mi.Vector3f(aim_x, aim_y, -up))
-            through, slope = table.steep(spots.at(leaves), out.z, collides)
-            bend = phase(g, dr.dot(way, mi.Vector3f(aim_x, aim_y, -up)))
-            depth = extinction * run
+            out = down / length
+            away = -dr.dot(out, normal)
+            along = index * (out + away * normal)
+            up = dr.safe_sqrt(1.0 - dr.squared_norm(along))
+            aim, run = along - up * normal, depth / dr.maximum(up, 1e-6)
+            leaves, _ = relief.onto(where + run * aim)
+            through, slope = table.steep(spots.at(leaves), away, collides)
+            dense = extinction * run
             if lump is not None:
-                depth += more * run * lump.share(world(where), leaves)
-            amount = throughput * share * bend * dr.exp(-depth) / up
+                dense += more * run * lump.share(where, leaves)
+            amount = throughput * share * phase(g, dr.dot(way, aim)) * dr.exp(-dense) / up
             # a pixel sees more of what lies deeper; its radiance is that of the area it sees at the face
-            amount *= out.z * length * dr.square(1.0 - view.spread_per_mm * index * dr.maximum(where.z, 0.0))
+            amount *= away * length * dr.square(1.0 - view.spread_per_mm * index * dr.maximum(depth, 0.0))
             changes = zip(so_far, spots.derivatives(leaves), strict=True)
             slopes = [amount * (through * score + slope * change) for score, change in changes]
-            seen = collides & (out.z > 0.0) & (up > 0.0) & spots.covers(leaves)
+            seen = collides & (away > 0.0) & (up > 0.0) & spots.covers(leaves)
             view.add(number, leaves, [amount * through, *slopes], seen)
 
-    flat = mi.Vector2f(here.x, here.y) * index
-    way = mi.Vector3f(flat.x, flat.y, dr.safe_sqrt(1.0 - dr.squared_norm(flat)))
-    start = dr.zeros(mi.Point3f, dr.width(number))
+    start, normal = relief.onto(met.p)
+    along = index * (met.d - dr.dot(met.d, normal) * normal)
+    way = along + dr.safe_sqrt(1.0 - dr.squared_norm(along)) * normal
     where, way, share, _, random, scores = roam(
         body, start, way, random, passing, enters, witness, scores, scoring if scores else None
     )
-    flat = mi.Vector2f(way.x, way.y) / index
-    out = mi.Vector3f(flat.x, flat.y, dr.safe_sqrt(1.0 - dr.squared_norm(flat)))
-    return mi.Ray3f(world(where), frame.to_world(out)), share, random, scores
+    _, normal = relief.at(where)
+    along = (way - dr.dot(way, normal) * normal) / index
+    out = along - dr.safe_sqrt(1.0 - dr.squared_norm(along)) * normal
+    return mi.Ray3f(where, out), share, random, scores
 
 
 def behind(sensor: Sensor) -> float:

@@ -7,11 +7,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 from skfem import MeshHex2
-from test_fem_element import curved_cube
+from test_fem_element import curved_cube, integrals
 
 import fem
 from fem import elasticity
-from fem.quadrature import Quadrature, quadrature
+from fem.quadrature import Quadrature
 
 Floats = NDArray[np.float64]
 
@@ -25,7 +25,7 @@ def block() -> tuple[MeshHex2, Quadrature, Floats, Floats]:
     """Curved mesh of eight elements, its moduli (E = 5 kPa, nu = 0.49)."""
     mesh = curved_cube(2)
     shear, bulk = elasticity.lame(np.full(8, 5.0), np.full(8, 0.49))
-    return mesh, quadrature(mesh), shear, bulk
+    return mesh, integrals(mesh), shear, bulk
 
 
 def nodal(quad: Quadrature, forces: Floats) -> Floats:

@@ -300,7 +300,7 @@ def test_the_tissue_is_linearised(variant, name):
     light = direct.direct(sensor(), basis, press()).astype(np.float32)
 
     def seen(off):
-        there = transport.Ground(ground.fraction + off * slope, ground.meets)
+        there = replace(ground, fraction=ground.fraction + off * slope)
         return transport.Under.at(basis, behind, there).seen(light)
 
     under = transport.Under.at(basis, behind, ground)

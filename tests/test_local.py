@@ -20,13 +20,13 @@ def test_gathered_light_is_what_rays_count_in_the_same_pixels(variant: str, coup
     sensor = dense(paper_sensor(coupling, **COARSE))  # type: ignore[arg-type]
     renderer = Renderer(sensor, "cpu")
     put_surface(renderer.scene, sensor, surface.resample(bump(), sensor.guide.width_mm))
-    fraction = transport.survey(renderer.scene, sensor).fraction
+    ground = transport.survey(renderer.scene, sensor)
     parts = (renderer.scene, sensor, renderer.table, renderer.rays)
     straight = local.straight(*parts)
     assert straight.shape == (4, 16, 24) and (straight >= 0.0).all()
 
     def pictures(**how: object) -> np.ndarray:
-        runs = [exact.exact(*parts, fraction, 2**15, seed, local=True, **how)[0] for seed in range(6)]  # type: ignore[arg-type]
+        runs = [exact.exact(*parts, ground, 2**15, seed, local=True, **how)[0] for seed in range(6)]  # type: ignore[arg-type]
         return np.sum(runs, axis=1)[:, 2:-2, 3:-3]
 
     followed, gathered = pictures(), pictures(gathered=straight)

@@ -125,11 +125,13 @@ def test_a_pencil_beam_over_a_lump_comes_back_as_the_walk_has_it(variant: str, t
     met = SimpleNamespace(
         p=mi.Point3f(*map(float, entry)) + mi.Vector3f(lanes, lanes, lanes),
         d=mi.Vector3f(*map(float, -normal)) + mi.Vector3f(lanes, lanes, lanes),
-        normal=mi.Vector3f(*map(float, normal)) + mi.Vector3f(lanes, lanes, lanes),
     )
+    line = (np.arange(8) + 0.5) / 8 * 25.0 - 12.5
+    plane = entry[2] - (line - entry[0]) * normal[0] / normal[2] + 0.0 * line[:, None]
+    relief = wander.Relief.on(plane, 25.0)
     above, lump = Above(normal), wander.Lump.of(MATCHED, place)
     _, left, _, _ = wander.wander(
-        MATCHED, table, spots, [above], met, dr.arange(mi.UInt32, LANES), dr.ones(mi.Float, LANES),
+        MATCHED, table, spots, relief, [above], met, dr.arange(mi.UInt32, LANES), dr.ones(mi.Float, LANES),
         mi.Bool(True), walk.generator(LANES, 3), (), lump,
     )  # fmt: skip
     back = np.asarray(left, np.float64).reshape(-1, LOTS).mean(axis=0)
@@ -172,7 +174,7 @@ def test_energy_closes_with_a_lump(variant: str) -> None:
         dr.scatter_add(total, mi.Int64(dr.round(lost * 2.0**20)), place, collides)
 
     way = mi.Vector3f(0.0, 0.0, 1.0) + dr.zeros(mi.Vector3f, LANES)
-    body = walk.Body(medium, ball=wander.Below(lump, lambda place: place))
+    body = walk.Body(medium, ball=lump)
     _, _, left, _, _, _ = walk.roam(
         body,
         dr.zeros(mi.Point3f, LANES),

@@ -52,7 +52,8 @@ def test_scores_are_what_finite_differences_find(renderer):
 
     build.put_surface(renderer.scene, renderer.sensor, surface.resample(bump(0.4), WIDTH))
     parts = renderer.scene, renderer.sensor, renderer.table, renderer.rays
-    fraction = transport.survey(renderer.scene, renderer.sensor).fraction
+    ground = transport.survey(renderer.scene, renderer.sensor)
+    fraction = ground.fraction
     parameters = mi.traverse(renderer.scene)
     name = "contact.vertex_contact_fraction"
     mesh = mi.Float(parameters[name])
@@ -61,7 +62,7 @@ def test_scores_are_what_finite_differences_find(renderer):
     def seen(scale, seed):
         parameters[name] = mesh * scale
         parameters.update()
-        return exact.exact(*parts, fraction * scale, 2**15, seed)
+        return exact.exact(*parts, replace(ground, fraction=fraction * scale), 2**15, seed)
 
     left = fraction * (np.arange(fraction.shape[1]) < fraction.shape[1] // 2)
     slopes = np.stack([fraction, left, fraction - left])
@@ -69,7 +70,7 @@ def test_scores_are_what_finite_differences_find(renderer):
     for seed in range(8):
         difference = (seen(1 + step, seed) - seen(1 - step, seed)) / (2 * step)
         value = seen(1.0, seed)
-        found = exact.exact(*parts, fraction, 2**15, seed, slopes=slopes)
+        found = exact.exact(*parts, ground, 2**15, seed, slopes=slopes)
         np.testing.assert_array_equal(found[0], value)  # who asks for slopes sees the same picture
         difference, *answers = (one.sum(axis=(1, 2, 3)) for one in (difference, *found[1:]))
         np.testing.assert_allclose(answers[0], answers[1] + answers[2], rtol=1e-4)
@@ -89,12 +90,13 @@ def test_scores_know_no_other_order_of_paths(renderer):
 
     build.put_surface(renderer.scene, renderer.sensor, surface.resample(bump(0.4), WIDTH))
     parts = renderer.scene, renderer.sensor, renderer.table, renderer.rays
-    fraction = transport.survey(renderer.scene, renderer.sensor).fraction
-    found = exact.exact(*parts, fraction, 2**8, 0, slopes=np.zeros((2, *fraction.shape)))
+    ground = transport.survey(renderer.scene, renderer.sensor)
+    fraction = ground.fraction
+    found = exact.exact(*parts, ground, 2**8, 0, slopes=np.zeros((2, *fraction.shape)))
     assert found.shape[0] == 3
     assert np.abs(found[1:]).max() == 0.0
     with pytest.raises(ValueError, match="slopes"):
-        exact.exact(*parts, fraction, 2**8, 0, local=True, slopes=fraction[None])
+        exact.exact(*parts, ground, 2**8, 0, local=True, slopes=fraction[None])
 
 
 def test_a_change_told_apart_adds_up(renderer):
@@ -149,8 +151,8 @@ def test_moves_are_answered_as_rays_answer_them(renderer):
         parts = renderer.scene, renderer.sensor
         build.put_surface(*parts, shape)
         sight = gather.look(*parts, renderer.table, renderer.behind.coupling, renderer.rays)
-        fraction = transport.survey(*parts).fraction
-        found = exact.exact(*parts, renderer.table, renderer.rays, fraction, 2**18, seed)
+        ground = transport.survey(*parts)
+        found = exact.exact(*parts, renderer.table, renderer.rays, ground, 2**18, seed)
         return 1e6 * (np.einsum("snyx,syx->yx", found, sight.windows) + sight.lamps.sum(axis=0))
 
     there, far = scored.moved_along(middle, 0.1 * down), 0.1

@@ -65,9 +65,9 @@ def test_equal_noise_sooner_than_path(variant: str, coupling: str) -> None:
     dense = Tissue(scattering_per_mm=1000.0, absorption_per_mm=20.0)
     renderer = Renderer(dataclasses.replace(sensor(coupling), tissue=dense), device="cpu")
     renderer.render(blob(), samples=2**12)  # compile
-    scene, fraction = renderer.scene, transport.survey(renderer.scene, renderer.sensor).fraction
+    scene, ground = renderer.scene, transport.survey(renderer.scene, renderer.sensor)
     sight = gather.look(scene, renderer.sensor, renderer.table, renderer.behind.coupling, renderer.rays)
-    parts = (scene, renderer.sensor, renderer.table, renderer.rays, fraction)
+    parts = (scene, renderer.sensor, renderer.table, renderer.rays, ground)
     straight = local.straight(*parts[:4])
     exact.exact(*parts, 2**10, 0, local=True, gathered=straight)  # compile
 

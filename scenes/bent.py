@@ -1,0 +1,69 @@
+"""What tissue gives back under a bent contact, over what it gives back under a flat one.
+
+Under a face that bulges into it there is more tissue for each area of the face the deeper one looks, by
+1 + H z with H the sum of both curvatures. Diffuse light that falls as exp(-λ z) under a flat face then falls
+as exp(-(λ + H/2) z), to first order: φ'' + H φ' - λ² φ = 0. Its decay also grows with the lateral wave
+number, λ² = λ0² + k² (`slab`), so that the flat reflectance tells what a faster decay costs: d ln R / dλ =
+(λ/k) d ln R / dk. Light that the face throws back comes again: R / (1 - w R) in place of R.
+
+All else of standard light has tissue flat; the reference (`wander`) walks under the surface as it is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+
+from .slab import decay_rate
+from .tissue import TissueOptics
+
+Array = NDArray[np.float64]
+
+_NODES = 160  # wave numbers at which the flat reflectance is worked out
+_LEAST, _MOST = 1e-3, 1e3  # of them, per transport mean free path
+
+
+@dataclass(frozen=True)
+class Bent:
+    """The answer to curvature of one tissue, on square cells over the guide's face; make it with `bent`.
+
+    Attributes
+    ----------
+    reflectance, answer : (p, p // 2 + 1)
+        R and d ln R / dλ, mm, at the wave numbers of maps padded to p cells.
+    cell_mm
+        Side of a cell.
+    """
+
+    reflectance: Array
+    answer: Array
+    cell_mm: float
+
+    def on(self, height_mm: Array, thrown: float) -> Array:
+        """Light given back over that under a flat face, (m, m), where the face is at heights [iy, ix] (m, m),
+        mm, and throws back such a share of what comes up under it."""
+        padded, (rows, columns) = len(self.answer), height_mm.shape
+        bends = np.zeros(height_mm.shape)
+        bends[1:-1] -= np.diff(height_mm, 2, axis=0)
+        bends[:, 1:-1] -= np.diff(height_mm, 2, axis=1)
+        spectrum = scipy.fft.rfft2(bends / self.cell_mm**2, (padded, padded), workers=1)
+        spectrum *= self.answer / (1.0 - thrown * self.reflectance)
+        found = scipy.fft.irfft2(spectrum, (padded, padded), workers=1)[:rows, :columns]
+        return np.asarray(1.0 + 0.5 * found)
+
+
+def bent(tissue: TissueOptics, width_mm: float, cells: int) -> Bent:
+    """Prepare the answer on `cells` x `cells` cells over a face of `width_mm`."""
+    padded, cell = int(scipy.fft.next_fast_len(2 * cells, real=True)), width_mm / cells
+    per_mm = tissue.transport_per_mm
+    kx, ky = (2.0 * np.pi * waves(padded, cell) for waves in (scipy.fft.rfftfreq, scipy.fft.fftfreq))
+    wave = np.clip(np.hypot(kx, ky[:, None]) / per_mm, _LEAST, _MOST)
+    nodes = np.geomspace(_LEAST, _MOST, _NODES)
+    flat = np.maximum(tissue.slab.reflectance(nodes), 1e-12)
+    steep = np.gradient(np.log(flat), np.log(nodes)) / nodes  # d ln R / dk
+    steep *= np.hypot(decay_rate(tissue.slab.albedo), nodes) / nodes
+    at = np.log(wave)
+    return Bent(np.interp(at, np.log(nodes), flat), np.interp(at, np.log(nodes), steep) / per_mm, cell)
