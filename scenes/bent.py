@@ -1,10 +1,10 @@
 """What tissue gives back under a bent contact, over what it gives back under a flat one.
 
 Under a face that bulges into it there is more tissue for each area of the face the deeper one looks, by
-1 + H z with H the sum of both curvatures. Diffuse light that falls as exp(-λ z) under a flat face then falls
-as exp(-(λ + H/2) z), to first order: φ'' + H φ' - λ² φ = 0. Its decay also grows with the lateral wave
-number, λ² = λ0² + k² (`slab`), so that the flat reflectance tells what a faster decay costs: d ln R / dλ =
-(λ/k) d ln R / dk. Light that the face throws back comes again: R / (1 - w R) in place of R.
+1 + H z with H the sum of both curvatures (Weyl 1939; key weyl1939). Diffuse light that falls as exp(-λ z)
+under a flat face then falls as exp(-(λ + H/2) z), to first order: φ'' + H φ' - λ² φ = 0. Its decay also grows
+with the lateral wave number, λ² = λ0² + k² (`slab`), so that the flat reflectance tells what a faster decay
+costs: d ln R / dλ = (λ/k) d ln R / dk. Light that the face throws back comes again: R / (1 - w R) for R.
 
 All else of standard light has tissue flat; the reference (`wander`) walks under the surface as it is.
 """
