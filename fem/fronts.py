@@ -73,7 +73,7 @@ class Batch:
         Pivots, with filling.
     """
 
-    rows: Ints
+    rows: NDArray[np.int32]
     width: int
 
 
@@ -184,7 +184,7 @@ def _batched(fronts: list[Front], order: Ints, dofs: Ints) -> Tree:
     def add(chosen: list[int]) -> None:
         width = max(fronts[i].pivots for i in chosen)
         below = max(len(fronts[i].border) for i in chosen)
-        rows = np.full((len(chosen), width + below), len(order))
+        rows = np.full((len(chosen), width + below), len(order), dtype=np.int32)
         for slot, i in enumerate(chosen):
             front = fronts[i]
             rows[slot, : front.pivots] = front.start + np.arange(front.pivots)
@@ -217,7 +217,8 @@ def _batched(fronts: list[Front], order: Ints, dofs: Ints) -> Tree:
                 for low, high in pairwise(ends):
                     inner = front.start + np.arange(low, front.pivots)
                     found.append((len(batches), 0, int(low), int(high)))
-                    batches.append(Batch(np.concatenate([inner, front.border])[None], int(high - low)))
+                    rows = np.concatenate([inner, front.border]).astype(np.int32)
+                    batches.append(Batch(rows[None], int(high - low)))
                 panels[i] = tuple(found)
     placed = tuple(replace(front, panels=panels.get(i, ())) for i, front in enumerate(fronts))
     return Tree(placed, tuple(batches), order, dofs)

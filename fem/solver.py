@@ -197,7 +197,7 @@ class Factor:
         x[:, self.tree.order] = columns
         steps = list(zip(self.tree.batches, self._panels, strict=True))
 
-        def times(panels: Array, rows: Ints) -> Array:
+        def times(panels: Array, rows: NDArray[np.int32]) -> Array:
             return panels @ np.ascontiguousarray(x[:, rows].transpose(1, 2, 0))
 
         with one_thread():
