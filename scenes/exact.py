@@ -29,6 +29,7 @@ from .view import PixelRays, below_mm
 Array = NDArray[np.float64]
 
 _MAP = 256  # nodes per side of the maps from surface to film
+_WIDER = 1.2  # than the guide's face they are: a rim that is pressed towards the camera looks larger
 _FIXED_POINT = float(2**26)
 _HAIR_MM = 1e-3
 _BELOW_MM = 0.5  # the surface is looked for from here
@@ -41,7 +42,8 @@ class Film:
     Attributes
     ----------
     film : (_MAP, _MAP, 2)
-        Column and row (x.5 are pixels' middles) of the node [iy, ix] of a grid over the guide's face.
+        Column and row (x.5 are pixels' middles) of the node [iy, ix] of a grid over the guide's face and
+        some more (`_WIDER`).
     lean : (_MAP, _MAP, 2)
         Run in x and y per mm of height of the camera's ray through it.
     area_mm2 : (rows, columns)
@@ -62,7 +64,7 @@ class Film:
         by_column, by_row = (np.gradient(hits, axis=axis) for axis in (1, 0))
         area = np.abs(by_column[..., 0] * by_row[..., 1] - by_column[..., 1] * by_row[..., 0])
 
-        line = np.linspace(-0.5, 0.5, _MAP) * sensor.guide.width_mm
+        line = np.linspace(-0.5, 0.5, _MAP) * _WIDER * sensor.guide.width_mm
         target = np.stack(np.meshgrid(line, line), axis=-1)
         middle = np.array([rows // 2, columns // 2])
         scale = np.array([by_column[*middle, 0], by_row[*middle, 1]])
@@ -105,14 +107,14 @@ class _View:
         stacked = np.concatenate([film.film, film.lean], axis=-1).astype(np.float32)
         maps = mi.Texture2f(mi.TensorXf(stacked), wrap_mode=dr.WrapMode.Clamp)
         layers = dr.zeros(mi.Int64, len(sensor.leds) * rows * columns * many)
-        width, middle = sensor.guide.width_mm, _MAP // 2
+        width, middle = _WIDER * sensor.guide.width_mm, _MAP // 2
         spread = (
             (film.lean[middle, middle + 1, 0] - film.lean[middle, middle - 1, 0]) * (_MAP - 1) / width / 2
         )
         return _View(maps, rows, columns, width, many, layers, float(spread))
 
     def _look_up(self, x: mi.Float, y: mi.Float) -> list[mi.Float]:
-        # nodes sit at the ends of the face, a texture's in the middle of its texels
+        # nodes sit at the ends of the map, a texture's in the middle of its texels
         u, v = (((at / self.width + 0.5) * (_MAP - 1) + 0.5) / _MAP for at in (x, y))
         return list(self.maps.eval(mi.Point2f(u, v)))
 
