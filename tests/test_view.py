@@ -235,3 +235,39 @@ def test_camera_looks_at_the_deformed_surface(mi: ModuleType) -> None:
     t = -(-0.2 + rays.origin_mm @ slope) / (rays.direction @ slope)
     expected = (rays.origin_mm + t[..., None] * rays.direction)[..., :2]
     np.testing.assert_allclose(sight.position_mm, expected, atol=2e-4)
+
+
+@pytest.mark.parametrize("name", ["paper", "near and wide"])
+def test_followed_light_is_seen_where_the_pixels_look(mi: ModuleType, name: str) -> None:
+    """Points of pixels' rays at heights about the face's are counted in those pixels; a rim that is pressed
+    far down, and so looks larger than the picture, in none."""
+    import drjit as dr
+
+    from scenes import exact
+
+    sensor = SENSORS[name]
+    rays = view.pixel_rays(sensor)
+    film = exact.Film.at(sensor, rays, 0.0)
+    rows, columns = rays.transmittance.shape
+    rng = np.random.default_rng(5)
+    row, column = rng.integers(0, rows, 400), rng.integers(0, columns, 400)
+    height = rng.uniform(-1.0, 0.2, 400)
+    origin, direction = rays.origin_mm[row, column], rays.direction[row, column]
+    run = (height + sensor.guide.top_mm) / direction[:, 2]
+    at = np.stack([*(origin + run[:, None] * direction)[:, :2].T, height])
+    on_face = (np.abs(at[:2]) < HALF_MM).all(axis=0)
+    places = mi.Point3f(*(mi.Float(part) for part in at.astype(np.float32)))
+    seen = exact._View.of(film, sensor)
+    seen.add(dr.zeros(mi.UInt32, 400), places, [dr.ones(mi.Float, 400)], mi.Bool(on_face))
+    expected = np.zeros((rows, columns))
+    np.add.at(expected, (row[on_face], column[on_face]), 1.0)
+    counted = seen.collected()[0, 0]
+    # a camera that is 5 % nearer sees 10 % more of it; none lies a pixel off
+    assert np.abs(counted - expected)[expected == 0].max(initial=0.0) == 0.0
+    assert counted[expected > 0] == pytest.approx(expected[expected > 0], rel=0.25)
+
+    beyond = exact._View.of(film, sensor)
+    edge = mi.Point3f(mi.Float(HALF_MM - 0.01), mi.Float(0.0), mi.Float(-2.0))
+    if sensor.camera.field_of_view_mm > 2.0 * HALF_MM - 0.5:
+        beyond.add(mi.UInt32(0), edge, [mi.Float(1.0)], mi.Bool(True))
+        assert beyond.collected().sum() == 0.0
