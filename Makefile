@@ -22,7 +22,7 @@ demo: $(READY)
 
 # Two processes: most tests use one core.
 test: $(READY)
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -rs
 
 test-all: $(READY)
 	$(BIN)/python -m pytest -m "slow or not slow" --timeout 3600

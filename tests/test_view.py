@@ -252,7 +252,9 @@ def test_followed_light_is_seen_where_the_pixels_look(mi: ModuleType, name: str)
     rows, columns = rays.transmittance.shape
     rng = np.random.default_rng(5)
     row, column = rng.integers(0, rows, 400), rng.integers(0, columns, 400)
-    height = rng.uniform(-1.0, 0.2, 400)
+    levels = [-1.0, -0.5, 0.2]
+    which = rng.integers(0, len(levels), 400)
+    height = np.array(levels)[which]
     origin, direction = rays.origin_mm[row, column], rays.direction[row, column]
     run = (height + sensor.guide.top_mm) / direction[:, 2]
     at = np.stack([*(origin + run[:, None] * direction)[:, :2].T, height])
@@ -261,11 +263,14 @@ def test_followed_light_is_seen_where_the_pixels_look(mi: ModuleType, name: str)
     seen = exact._View.of(film, sensor)
     seen.add(dr.zeros(mi.UInt32, 400), places, [dr.ones(mi.Float, 400)], mi.Bool(on_face))
     expected = np.zeros((rows, columns))
-    np.add.at(expected, (row[on_face], column[on_face]), 1.0)
+    areas = np.stack([exact.Film.at(sensor, rays, level).area_mm2 for level in levels])
+    larger = (film.area_mm2 / areas)[which, row, column]  # a pixel sees less of what is nearer
+    np.add.at(expected, (row[on_face], column[on_face]), larger[on_face])
     counted = seen.collected()[0, 0]
-    # a camera that is 5 % nearer sees 10 % more of it; none lies a pixel off
-    assert np.abs(counted - expected)[expected == 0].max(initial=0.0) == 0.0
-    assert counted[expected > 0] == pytest.approx(expected[expected > 0], rel=0.25)
+    assert np.abs(counted[expected == 0]).max(initial=0.0) == 0.0  # none lies a pixel off
+    # the slope of rays over the face is taken from its middle: 1 % off from 12 mm, 0.1 % from the paper's 40
+    off = 1.5e-2 if "near" in name else 2e-3
+    assert counted[expected > 0] == pytest.approx(expected[expected > 0], rel=off)
 
     beyond = exact._View.of(film, sensor)
     edge = mi.Point3f(mi.Float(HALF_MM - 0.01), dr.linspace(mi.Float, -9.0, 9.0, 301), mi.Float(-0.5))
