@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from .ftir import gap_transmittance
 from .slab import Slab, cosines
 
 Array = NDArray[np.float64]
@@ -30,9 +31,10 @@ _AZIMUTHS, _WAVES = 24, 60
 _TOP = 25.0  # of k, 1/mean free path: beyond, all fall as 1/k
 _GRAZING = 0.1  # cosine below which little gets through any contact
 _DARK = 1e-4  # answer whose parts do not matter
-ALL, STEEP, DEEP = 0, 1, 2
+_BLACK = 1e-12  # share that comes back, below which nothing does
+ALL, STEEP, DEEP, HELD = 0, 1, 2, 3
 """What is asked of the light that comes out: all of it; its radiance factor along the normal; the same times
-the depth of the last collision, mm."""
+the depth of the last collision, mm; what bare skin throws back of it."""
 
 
 @dataclass(frozen=True)
@@ -43,10 +45,12 @@ class Aslant:
     ----------
     functions : by harmonic m, (r_m, n)
         h_mr on cosines in the tissue uniform on 0..1; in harmonic 0 the tissue's lobes φ_i come first.
-    transforms : by harmonic m, (3, r_m, K)
+    transforms : by harmonic m, (4, r_m, K)
         X_mr of what `ALL` leaves, over the transform of Lambertian light, of what leaves `STEEP`, and `DEEP`.
         Light that leaves not quite along the normal seems to come from behind, by that depth times the sine
-        of the angle in the tissue.
+        of the angle in the tissue. `HELD` as `ALL`: mostly grazing light is thrown back; it comes from less
+        deep, so that what went in aslant is less far ahead. Its total is that of `ALL`: what more there is,
+        local modes have.
     """
 
     transport_per_mm: float
@@ -60,9 +64,9 @@ class Aslant:
         return np.asarray(found * (_TOP / np.maximum(scaled, _TOP)) ** tail)
 
 
-def aslant(body: Slab, transport_per_mm: float, lobes: Array) -> Aslant:
+def aslant(body: Slab, transport_per_mm: float, lobes: Array, refractive_index: float) -> Aslant:
     """Take the answer of a body apart: `lobes` (modes, n) are its φ_i on cosines uniform on 0..1."""
-    beams, diffuse = _beams(body)
+    beams, diffuse = _beams(body, refractive_index)
     cosine, _ = cosines()
     by_harmonic = np.fft.fft(beams, axis=3) / _AZIMUTHS
     peak = np.maximum(np.abs(beams).max(axis=(1, 2, 3)), _DARK)[:, None, None]
@@ -82,21 +86,52 @@ def aslant(body: Slab, transport_per_mm: float, lobes: Array) -> Aslant:
         count = int(np.argmax(np.array(rest) <= _ENOUGH))
         shares = np.hstack([share, left[:, :count] * sizes[:count]]).reshape(DEEP, diffuse.size, -1)
         every = np.vstack([known, shapes[:count]])  # enough for depths, too: they are asked for a small part
-        deep = np.linalg.lstsq(every.T, values[DEEP].T, rcond=None)[0].T
-        shares = np.concatenate([shares, deep[None]]) / fine * peak
-        shares[ALL] /= np.maximum(diffuse, 1e-300)[:, None]
+        more = [np.linalg.lstsq(every.T, values[what].T, rcond=None)[0].T for what in (DEEP, HELD)]
+        shares = np.concatenate([shares, more]) / fine * peak
+        shares[[ALL, HELD]] /= np.maximum(diffuse, 1e-300)[:, None]
         shares[DEEP] /= transport_per_mm
         transforms.append(np.moveaxis(shares, 1, 2))
-        more = CubicSpline(cosine, shapes[:count] / seen, axis=1)(grid)
-        functions.append(np.vstack([lobes, more]) if m == 0 else more)
+        # odd harmonics go with the sine of the angle, which no spline in the cosine follows to the normal
+        sine = [np.sqrt(1.0 - values**2) if m % 2 else np.ones(values.size) for values in (cosine, grid)]
+        further = CubicSpline(cosine, shapes[:count] / seen / sine[0], axis=1)(grid) * sine[1]
+        functions.append(np.vstack([lobes, further]) if m == 0 else further)
     return Aslant(transport_per_mm, tuple(functions), tuple(transforms))
 
 
 @lru_cache(maxsize=16)
-def _beams(slab: Slab) -> tuple[NDArray[np.complex128], Array]:
-    """`Slab.aslant` at the Gauss cosines, and the transform of Lambertian light; 0.2 s."""
+def _beams(slab: Slab, refractive_index: float) -> tuple[NDArray[np.complex128], Array]:
+    """`Slab.aslant` and what is `HELD` at the Gauss cosines, and the transform of Lambertian light; 0.5 s."""
     azimuth = 2.0 * np.pi * np.arange(_AZIMUTHS) / _AZIMUTHS
-    return slab.aslant(_waves(), cosines()[0], azimuth), slab.reflectance(_waves())
+    beams, diffuse = slab.aslant(_waves(), cosines()[0], azimuth), slab.reflectance(_waves())
+    held = beams[ALL]
+    if np.isinf(slab.depth) and diffuse[0] > _BLACK:
+        t_s, t_p = gap_transmittance(refractive_index, 1.0, 1.0, 0.0, cosines()[0], 550.0)  # any wavelength
+        found = by_exit(beams[STEEP], 1.0 - 0.5 * (t_s + t_p))
+        held = (found - found[0]) * diffuse[:, None, None] + held[0] * (diffuse / diffuse[0])[:, None, None]
+    return np.concatenate([beams, held[None]]), diffuse
+
+
+def by_exit(steep: NDArray[np.complex128], counts: Array) -> NDArray[np.complex128]:
+    """What comes out of a half-space where each exit cosine (N,) counts so much, over the same of Lambertian
+    light, (K, N, azimuths), from what leaves along the normal, of like shape.
+
+    With p = 1/µ + i k tanθ cosφ the radiance factor is h(p) h(p') / (µ µ' (p + p')) in and out, as at k = 0
+    (Chandrasekhar 1960, ch. IV; key chandrasekhar1960), because what an entering beam excites is one function
+    of p (`Slab.aslant`); p = 1 along the normal tells h.
+    """
+    mu, weight = cosines()
+    side = _AZIMUTHS // 2 + 1  # azimuths 0..π: the other side is like it
+    turns, ends = np.cos(np.pi * np.arange(side) / (side - 1)), np.full(side, 2.0 / _AZIMUTHS)
+    ends[[0, -1]] /= 2.0
+    even, tangent = 2.0 * mu * weight, np.sqrt(1.0 - mu**2) / mu
+    out = ((even * counts / mu)[:, None] * ends).ravel()
+    found = np.empty_like(steep)
+    for number, wave in enumerate(_waves()):
+        p = (1.0 / mu[:, None] + 1j * wave * tangent[:, None] * turns).ravel()
+        own = (steep[number, :, :side] * mu[:, None]).ravel() * (p + 1.0)
+        given = (own * ((1.0 / (p[:, None] + p)) @ (own * out))).reshape(mu.size, side) / mu[:, None]
+        found[number] = np.hstack([given, given[:, -2:0:-1]]) / (even @ given @ ends)
+    return found
 
 
 def _waves() -> Array:

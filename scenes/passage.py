@@ -13,7 +13,7 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from .aslant import ALL, DEEP, STEEP
+from .aslant import ALL, DEEP, HELD, STEEP
 from .tissue import Coupling
 
 Array = NDArray[np.float64]
@@ -78,9 +78,10 @@ class Passage:
 
     Attributes
     ----------
-    entering, seen, deep : (functions, p, p // 2 + 1)
+    entering, leaving, seen, deep : (functions, p, p // 2 + 1)
         Fourier transforms of the kernels, over cells, padded so that nothing wraps round: of Lambertian light
-        that comes out as all that entered does, of the light towards the camera, and of that times its depth.
+        of which as much is thrown back as of what entered, and of which as much comes out; of the light
+        towards the camera, and of that times its depth.
     shift : (p, p // 2 + 1)
         Moves the origin from the guide's first cell to the margin's.
     rings, turns
@@ -96,6 +97,7 @@ class Passage:
     """
 
     entering: NDArray[np.complex64]
+    leaving: NDArray[np.complex64]
     seen: NDArray[np.complex64]
     deep: NDArray[np.complex64]
     shift: NDArray[np.complex64]
@@ -140,7 +142,8 @@ class Passage:
         """What the face throws back, as `enter` has it, beyond what `spread` knows: that takes it for
         Lambertian, but light that leaves aslant goes on in its direction when it is mirrored.
 
-        By reciprocity light that entered evenly leaves as light that comes out evenly has entered.
+        By reciprocity light that entered evenly leaves as light that comes out evenly has entered: aslant
+        where it is not the same all over. The local modes are beside that.
 
         Parameters
         ----------
@@ -154,15 +157,16 @@ class Passage:
         halves = [self.rings + half * self.turns + np.arange(self.turns) for half in (0, 1)]
         entering, glimpse = self._nothing(len(light))
         for number, fields in enumerate(light):
-            thrown = _weighed(face.even[:, : len(fields)], fields)
-            spectra = self._forth(thrown)
+            lit, modes = self._forth(fields[0]), len(fields)
+            leaving = self._back(lit * self.leaving[rings])
+            leaving[1:modes] += fields[1:]
+            spectra = self._forth(_weighed(face.even, leaving))
+            known = self._forth(_weighed(face.even[:1, :modes], fields)[0])
             glimpse.deep[number] = _summed(spectra, self.deep[rings])
-            found, seen = (
-                _summed(spectra, self.entering[rings]) - spectra[0],
-                _summed(spectra, self.seen[rings]),
-            )
+            found = _summed(spectra, self.entering[rings]) - known
+            seen = _summed(spectra, self.seen[rings])
             if turning:
-                aslant = self._back(self._forth(fields[0]) * self.entering[np.concatenate(halves)])
+                aslant = self._back(lit * self.leaving[np.concatenate(halves)])
                 for half, own in zip(halves, np.split(aslant, len(halves)), strict=True):
                     spectra = self._forth(_weighed(face.turning, own))
                     found += _summed(spectra, self.entering[half])
@@ -250,17 +254,18 @@ def passage(coupling: Coupling, width_mm: float, cells: int, margin: int) -> Pas
     kx, ky = (2.0 * np.pi * waves(padded, step) for waves in (scipy.fft.rfftfreq, scipy.fft.fftfreq))
     k, azimuth = np.hypot(kx, ky[:, None]), np.arctan2(ky[:, None], kx)
     shift = np.exp(-1j * margin * step * (kx + ky[:, None])).astype(np.complex64)
-    kernels: tuple[list[NDArray[np.complex64]], ...] = ([], [], [])
+    kernels: dict[int, list[NDArray[np.complex64]]] = {HELD: [], ALL: [], STEEP: [], DEEP: []}
     for m, transforms in enumerate(apart.transforms):
         for turn in (np.cos, np.sin) if m else (np.cos,):
-            for what, tail in ((ALL, 0.0), (STEEP, 1.0), (DEEP, 2.0)):
+            for what, tail in ((HELD, 0.0), (ALL, 0.0), (STEEP, 1.0), (DEEP, 2.0)):
                 found = apart.at(transforms[what], k, tail) * turn(m * azimuth) * (1j if m % 2 else 1.0)
                 kernels[what].extend(found.astype(np.complex64))
-    entering, seen, deep = (np.array(one, dtype=np.complex64) for one in kernels)
+    spectra = {what: np.array(one, dtype=np.complex64) for what, one in kernels.items()}
     return Passage(
-        entering,
-        seen,
-        deep,
+        spectra[HELD],
+        spectra[ALL],
+        spectra[STEEP],
+        spectra[DEEP],
         shift,
         len(apart.functions[0]),
         len(apart.functions[1]),

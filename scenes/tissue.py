@@ -186,7 +186,7 @@ def couple(optics: ContactOptics, tissue: TissueOptics, n_guide: float, n_tissue
     scale = (n_guide / n_tissue) ** 2
     inside = 1.0 - scale * (1.0 - cosine**2)  # squared cosine in the tissue
     there, grid = np.sqrt(np.maximum(inside, 0.0)), np.linspace(0.0, 1.0, _COSINES)
-    apart = aslant(tissue.slab, tissue.transport_per_mm, tissue.lobes)
+    apart = aslant(tissue.slab, tissue.transport_per_mm, tissue.lobes, n_tissue)
     mu, weight = cosines()
     moments, critical = 2.0 * moment_weights(cosine), _passed_by_bare_skin(n_tissue)
     ways, thrown, free = [], [], []

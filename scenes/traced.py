@@ -30,7 +30,7 @@ _COARSE = 50  # cells per side on which modes are kept
 _FINE = 100  # on which their mean is
 _BEYOND = 2.0  # how far inputs may leave what was learned, times its reach
 FORMAT = "tsis-traced-2"
-LIGHT = 4
+LIGHT = 5
 """Counts up when pictures of the same press change: what was learned or kept before is of no use then."""
 ARRAYS = ("centre", "axes", "reach", "weights", "mean", "modes")
 """Fields of `TracedLight` that are arrays."""
