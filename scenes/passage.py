@@ -138,7 +138,7 @@ class Passage:
 
         return Face(at(0), 0.5 * at(1))
 
-    def thrown_back(self, upward: Array, face: Face, *, even: bool = False) -> tuple[Array, Glimpse]:
+    def thrown_back(self, upward: Array, face: Face) -> tuple[Array, Glimpse]:
         """What the face throws back, as `enter` has it, beyond what `spread` knows: that takes it for
         Lambertian, but light that leaves aslant goes on in its direction when it is mirrored.
 
@@ -149,11 +149,8 @@ class Passage:
         ----------
         upward : (n, modes, cells, cells)
             V, from `spread`.
-        even
-            Leave out what turns with the azimuth, as depths do always.
         """
         rings, light = slice(self.rings), upward.astype(np.float32)
-        turning = self.turns > 0 and not even
         halves = [self.rings + half * self.turns + np.arange(self.turns) for half in (0, 1)]
         entering, glimpse = self._nothing(len(light))
         for number, fields in enumerate(light):
@@ -165,7 +162,7 @@ class Passage:
             glimpse.deep[number] = _summed(spectra, self.deep[rings])
             found = _summed(spectra, self.entering[rings]) - known
             seen = _summed(spectra, self.seen[rings])
-            if turning:
+            if self.turns:
                 aslant = self._back(lit * self.leaving[np.concatenate(halves)])
                 for half, own in zip(halves, np.split(aslant, len(halves)), strict=True):
                     spectra = self._forth(_weighed(face.turning, own))
@@ -173,6 +170,16 @@ class Passage:
                     seen += _summed(spectra, self.seen[half])
             entering[number], glimpse.spectra[number] = self._back(found), seen
         return entering, glimpse
+
+    def last_thrown_back(self, upward: Array, face: Face) -> Glimpse:
+        """What the camera sees of light so weak that it may be taken to leave as `spread` has it."""
+        rings, light = slice(self.rings), upward.astype(np.float32)
+        _, glimpse = self._nothing(len(light))
+        for number, fields in enumerate(light):
+            spectra = self._forth(_weighed(face.even[:, : len(fields)], fields))
+            glimpse.spectra[number] = _summed(spectra, self.seen[rings])
+            glimpse.deep[number] = _summed(spectra, self.deep[rings])
+        return glimpse
 
     def towards_camera(self, *glimpses: Glimpse) -> Seen:
         """What leaves towards the camera, all passes together."""

@@ -188,10 +188,10 @@ class Response:
                 more[1 + k, 0] += extra[0]
                 turned[k].append(glimpse)
         more = self._answered(more, 1e-3)
-        _, last = passage.thrown_back(more, face, even=True)
+        last = passage.last_thrown_back(more, face)
         for parts, change in zip(turned, self.changes, strict=True):
             if change.face is not None:
-                parts.append(passage.thrown_back(more[:1], change.face, even=True)[1])
+                parts.append(passage.last_thrown_back(more[:1], change.face))
         whole = [[one.only(k) for one in (first, again, last)] for k in range(len(entering))]
         seen = [passage.towards_camera(*whole[0])]
         for parts, beside in zip(whole[1:], turned, strict=True):

@@ -310,7 +310,7 @@ class Under:
             more = np.zeros_like(upward)
             more[:, 0] = further
             more = self.bed.solve(more, 1e-3)
-            _, last = passage.thrown_back(more, self.face, even=True)
+            last = passage.last_thrown_back(more, self.face)
             return passage.towards_camera(glimpse, again, last)
 
         return Seen.of(abreast(one, len(landed)))

@@ -234,14 +234,18 @@ def test_gathered_light_is_differentiated_through_its_loops(variant, lower, name
 
 def test_derivatives_come_with_the_picture(variant):
     """The picture is the renderer's own but for the order of its sums, which libraries choose by the size of
-    what they sum and by processor; that of the flux is the picture over the flux; every parameter answers."""
+    what they sum and by processor: a few 1e-6, and where one of the paths that leave the tissue takes another
+    turn by it, some 1e-5 over a millimetre (of seeds 3 to 9 two do). That of the flux is the picture over the
+    flux; every parameter answers."""
     names = ["leds.flux_W", "skin.rms_slope"]
     from scenes.gradients import gradients
 
     renderer = renderer_of(sensor())
     found = gradients(renderer, press(), parameters(names), samples=2**10, seed=3)
     plain = renderer.render(press(), samples=2**10, seed=3).radiance
-    np.testing.assert_allclose(np.maximum(found.radiance, 0.0), plain, rtol=1e-5)
+    apart = np.abs(np.maximum(found.radiance, 0.0) / plain - 1.0)
+    assert np.percentile(apart, 99) < 5e-6
+    assert apart.max() < 5e-5
     np.testing.assert_allclose(found.slopes[0], found.radiance / 0.01, rtol=1e-6)
     assert np.isfinite(found.slopes).all()
     assert (np.abs(found.slopes).max(axis=(1, 2, 3)) > 0.0).all()
