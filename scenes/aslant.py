@@ -100,7 +100,7 @@ def aslant(body: Slab, transport_per_mm: float, lobes: Array, refractive_index: 
 
 @lru_cache(maxsize=16)
 def _beams(slab: Slab, refractive_index: float) -> tuple[NDArray[np.complex128], Array]:
-    """`Slab.aslant` and what is `HELD` at the Gauss cosines, and the transform of Lambertian light; 1 to 2 s."""
+    """`Slab.aslant` and `HELD` at the Gauss cosines, and the transform of Lambertian light; 1 to 2 s."""
     azimuth = 2.0 * np.pi * np.arange(_AZIMUTHS) / _AZIMUTHS
     beams, diffuse = slab.aslant(_waves(), cosines()[0], azimuth), slab.reflectance(_waves())
     held = beams[ALL]
