@@ -235,8 +235,8 @@ def test_gathered_light_is_differentiated_through_its_loops(variant, lower, name
 def test_derivatives_come_with_the_picture(variant):
     """The picture is the renderer's own but for the order of its sums, which libraries choose by the size of
     what they sum and by processor: a few 1e-6, and where one of the paths that leave the tissue takes another
-    turn by it, some 1e-5 over a millimetre (of seeds 3 to 9 two do). That of the flux is the picture over the
-    flux; every parameter answers."""
+    turn by it, some 1e-5 over a millimetre (of seeds 3 to 9 two do; without those paths none, 5e-6). That of
+    the flux is the picture over the flux; every parameter answers."""
     names = ["leds.flux_W", "skin.rms_slope"]
     from scenes.gradients import gradients
 
