@@ -34,7 +34,7 @@ _DARK = 1e-4  # answer whose parts do not matter
 _BLACK = 1e-12  # share that comes back, below which nothing does
 ALL, STEEP, DEEP, HELD = 0, 1, 2, 3
 """What is asked of the light that comes out: all of it; its radiance factor along the normal; the same times
-the depth of the last collision, mm; what bare skin throws back of it."""
+the depth of the last collision, mm; what skin throws back of it that nothing touches."""
 
 
 @dataclass(frozen=True)
@@ -64,9 +64,12 @@ class Aslant:
         return np.asarray(found * (_TOP / np.maximum(scaled, _TOP)) ** tail)
 
 
-def aslant(body: Slab, transport_per_mm: float, lobes: Array, refractive_index: float) -> Aslant:
-    """Take the answer of a body apart: `lobes` (modes, n) are its φ_i on cosines uniform on 0..1."""
-    beams, diffuse = _beams(body, refractive_index)
+def aslant(
+    body: Slab, transport_per_mm: float, lobes: Array, refractive_index: float, gap_index: float
+) -> Aslant:
+    """Take the answer of a body apart: `lobes` (modes, n) are its φ_i on cosines uniform on 0..1, the indices
+    its own and that of what fills the gaps above it."""
+    beams, diffuse = _beams(body, refractive_index, gap_index)
     cosine, _ = cosines()
     by_harmonic = np.fft.fft(beams, axis=3) / _AZIMUTHS
     peak = np.maximum(np.abs(beams).max(axis=(1, 2, 3)), _DARK)[:, None, None]
@@ -99,13 +102,14 @@ def aslant(body: Slab, transport_per_mm: float, lobes: Array, refractive_index: 
 
 
 @lru_cache(maxsize=16)
-def _beams(slab: Slab, refractive_index: float) -> tuple[NDArray[np.complex128], Array]:
+def _beams(slab: Slab, refractive_index: float, gap_index: float) -> tuple[NDArray[np.complex128], Array]:
     """`Slab.aslant` and `HELD` at the Gauss cosines, and the transform of Lambertian light; 1 to 2 s."""
     azimuth = 2.0 * np.pi * np.arange(_AZIMUTHS) / _AZIMUTHS
     beams, diffuse = slab.aslant(_waves(), cosines()[0], azimuth), slab.reflectance(_waves())
     held = beams[ALL]
-    if np.isinf(slab.depth) and diffuse[0] > _BLACK:
-        t_s, t_p = gap_transmittance(refractive_index, 1.0, 1.0, 0.0, cosines()[0], 550.0)  # any wavelength
+    if np.isinf(slab.depth) and diffuse[0] > _BLACK and gap_index < refractive_index:
+        gap = gap_index, gap_index, 0.0  # endless: any wavelength will do
+        t_s, t_p = gap_transmittance(refractive_index, *gap, cosines()[0], 550.0)
         found = by_exit(beams[STEEP], 1.0 - 0.5 * (t_s + t_p))
         held = (found - found[0]) * diffuse[:, None, None] + held[0] * (diffuse / diffuse[0])[:, None, None]
     return np.concatenate([beams, held[None]]), diffuse

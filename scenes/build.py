@@ -46,7 +46,7 @@ def optics_of(sensor: Sensor) -> ContactOptics:
 def coupling_of(sensor: Sensor, optics: ContactOptics) -> Coupling:
     """Tissue or sheet of this sensor behind its contact."""
     index, body = body_behind(sensor.skin, sensor.tissue)
-    return couple(optics, body, sensor.guide.refractive_index, index)
+    return couple(optics, body, sensor.guide.refractive_index, index, sensor.skin.gap_index)
 
 
 def load_scene(sensor: Sensor, table: mi.TensorXf) -> mi.Scene:

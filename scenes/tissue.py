@@ -180,13 +180,15 @@ def body_behind(skin: Skin, tissue: Tissue) -> tuple[float, TissueOptics]:
     return sheet.refractive_index, optics
 
 
-def couple(optics: ContactOptics, tissue: TissueOptics, n_guide: float, n_tissue: float) -> Coupling:
+def couple(
+    optics: ContactOptics, tissue: TissueOptics, n_guide: float, n_tissue: float, n_gap: float
+) -> Coupling:
     """Put tissue behind a contact whose T(A_r, cos) is tabulated."""
     cosine = np.linspace(0.0, 1.0, optics.transmittance.shape[1])
     scale = (n_guide / n_tissue) ** 2
     inside = 1.0 - scale * (1.0 - cosine**2)  # squared cosine in the tissue
     there, grid = np.sqrt(np.maximum(inside, 0.0)), np.linspace(0.0, 1.0, _COSINES)
-    apart = aslant(tissue.slab, tissue.transport_per_mm, tissue.lobes, n_tissue)
+    apart = aslant(tissue.slab, tissue.transport_per_mm, tissue.lobes, n_tissue, n_gap)
     mu, weight = cosines()
     moments, critical = 2.0 * moment_weights(cosine), _passed_by_bare_skin(n_tissue)
     ways, thrown, free = [], [], []

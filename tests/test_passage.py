@@ -19,7 +19,7 @@ MARGIN = 6
 
 def setting(width_mm: float, cells: int, *tissue: float) -> tuple[TissueOptics, Coupling, Passage]:
     body = tissue_optics(*tissue)
-    coupling = couple(contact_optics(N1, 1.0, N3, 0.5, 10.0, 550.0), body, N1, N3)
+    coupling = couple(contact_optics(N1, 1.0, N3, 0.5, 10.0, 550.0), body, N1, N3, 1.0)
     return body, coupling, passage(coupling, width_mm, cells, MARGIN)
 
 

@@ -17,7 +17,7 @@ def setting(
 ) -> tuple[ContactOptics, TissueOptics, Coupling, Spread]:
     optics = contact_optics(N1, 1.0, N3, 0.5, 10.0, 550.0)
     tissue = tissue_optics(scattering, absorption, modes=modes)
-    coupling = couple(optics, tissue, N1, N3)
+    coupling = couple(optics, tissue, N1, N3, 1.0)
     return optics, tissue, coupling, spreader(tissue, coupling, WIDTH, cells)
 
 
@@ -129,7 +129,7 @@ def test_dark_stays_dark_and_a_black_sheet_gives_nothing_back() -> None:
     optics, _, _, spread = setting()
     assert np.all(spread.solve(np.zeros((1, 2, 100, 100)), patchy(100)) == 0.0)
     black = tissue_optics(0.0, 30.0, 0.3)
-    nothing = spreader(black, couple(optics, black, N1, N3), WIDTH, 100)
+    nothing = spreader(black, couple(optics, black, N1, N3, 1.0), WIDTH, 100)
     assert np.all(nothing.solve(np.ones((1, 2, 100, 100)), patchy(100))[:, 0] == 0.0)
 
 
@@ -137,7 +137,7 @@ def test_light_enters_and_leaves_a_thin_white_sheet_at_the_same_place() -> None:
     """A sheet of a tenth of a cell: the local gain at every cell but the rim's."""
     optics = contact_optics(N1, 1.0, N3, 0.5, 10.0, 550.0)
     sheet = tissue_optics(20.0, 0.1, 0.02, 0.8)
-    coupling = couple(optics, sheet, N1, N3)
+    coupling = couple(optics, sheet, N1, N3, 1.0)
     light = np.zeros((1, 2, 100, 100))
     light[0, 0] = 1.0
     upward = spreader(sheet, coupling, WIDTH, 100).solve(light, np.full((100, 100), 0.25))[0, :, 50, 50]

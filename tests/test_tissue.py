@@ -15,7 +15,7 @@ N1, N3 = 1.4336, 1.40
 
 def behind(tissue: TissueOptics, n_tissue: float = N3, **skin: float) -> Coupling:
     optics = contact_optics(N1, 1.0, n_tissue, 0.5, 10.0, 550.0, **skin)
-    return couple(optics, tissue, N1, n_tissue)
+    return couple(optics, tissue, N1, n_tissue, 1.0)
 
 
 def out_and_in(coupling: Coupling, dust: float = 0.0) -> np.ndarray:
@@ -68,7 +68,7 @@ def test_local_limit_without_angles_is_the_old_closed_form() -> None:
     tissue = tissue_optics(1.0, 0.02, modes=1)
     flat = dataclasses.replace(tissue, lobes=np.ones_like(tissue.lobes))
     optics = contact_optics(N1, 1.0, N3, tissue.reflectance, 10.0, 550.0)
-    gain = couple(optics, flat, N1, N3).gain[:, 0, 0]
+    gain = couple(optics, flat, N1, N3, 1.0).gain[:, 0, 0]
     np.testing.assert_allclose(gain, optics.diffuse_gain, rtol=1e-4)
 
 

@@ -223,7 +223,7 @@ def test_camera_looks_at_the_deformed_surface(mi: ModuleType) -> None:
 
     sensor = paper_sensor(columns=48, rows=32, field_of_view_mm=20.0)
     optics = build.optics_of(sensor)
-    coupling = couple(optics, tissue_optics(1.0, 0.02), sensor.guide.refractive_index, 1.40)
+    coupling = couple(optics, tissue_optics(1.0, 0.02), sensor.guide.refractive_index, 1.40, 1.0)
     packed = Table.pack(optics, coupling)
     scene = build.load_scene(sensor, packed)
     line = np.linspace(-HALF_MM, HALF_MM, NODES)

@@ -167,7 +167,7 @@ def test_spread_is_the_walk_under_a_face_that_changes_from_place_to_place(
 
     width, cells = 40.0, 160
     tissue = tissue_optics(1.0, 0.02)
-    coupling = couple(contact_optics(N1, 1.0, N3, 0.5, 10.0, 550.0), tissue, N1, N3)
+    coupling = couple(contact_optics(N1, 1.0, N3, 0.5, 10.0, 550.0), tissue, N1, N3, 1.0)
     bare = dataclasses.replace(coupling, held=np.stack([coupling.free, coupling.held[-1]]))  # A_r = 0: air
     x = (np.arange(cells) + 0.5) / cells * width - width / 2
     entering = np.zeros((1, 2, cells, cells))
@@ -212,7 +212,7 @@ def test_trapped_light_comes_back_to_the_camera_as_the_walk_says(steps: ModuleTy
     walked = light.sum(), light[outside > to_camera].sum()
 
     tissue = tissue_optics(1.0, 0.02)
-    coupling = couple(optics, tissue, N1, N3)
+    coupling = couple(optics, tissue, N1, N3, 1.0)
     node = round(128 * fraction)
     grid, passes = np.linspace(0, 1, 1025), optics.transmittance[node]
 
