@@ -9,7 +9,7 @@ import numpy as np
 import pyvista as pv
 import trimesh
 from numpy.typing import NDArray
-from scipy.interpolate import CloughTocher2DInterpolator, RectBivariateSpline
+from scipy.interpolate import CloughTocher2DInterpolator, make_interp_spline
 from scipy.ndimage import map_coordinates
 
 # It does without what fails, an interruption too (heard again: `twin.interrupt`), and would log a traceback.
@@ -48,6 +48,9 @@ def resample(
 ) -> OpticalSurface:
     """Interpolate the finite elements' surface onto the optical grid, C1-smooth, so normals are continuous.
 
+    What the pressure rises by at the guide's edge, where it is singular, falls off within one node, so that
+    it neither rings farther in nor changes the force.
+
     Parameters
     ----------
     surface
@@ -84,19 +87,44 @@ def resample(
 
 
 def _interpolate(points: Array, fields: Array, line: Array) -> Array:
-    """Fields (n, k) of points (n, 2) on the grid of `line` (m,), (m, m, k); splines if points are a grid."""
+    """Fields (n, k) of points (n, 2) on the grid of `line` (m,), (m, m, k); splines if points are a grid. The
+    fourth is the pressure."""
     columns, column = np.unique(np.round(points[:, 0], 9), return_inverse=True)
     rows, row = np.unique(np.round(points[:, 1], 9), return_inverse=True)
     if columns.size * rows.size == len(points) and min(columns.size, rows.size) > 3:
         grid = np.empty((rows.size, columns.size, fields.shape[1]))
         grid[row, column] = fields
-        layers = [
-            RectBivariateSpline(rows, columns, grid[..., k], s=0)(line, line) for k in range(fields.shape[1])
-        ]
-        return np.stack(layers, axis=-1)
+        found = []
+        for k in range(fields.shape[1]):
+            down, across = (_weights(nodes, line, edge=k == 3) for nodes in (rows, columns))
+            found.append(down @ grid[..., k] @ across.T)
+        return np.stack(found, axis=-1)
     x, y = np.meshgrid(line, line)
     # the hull is closed: pull the outermost samples inside by rounding's width, else they would be NaN
     return np.asarray(CloughTocher2DInterpolator(points, fields)(x * (1 - 1e-9), y * (1 - 1e-9)))
+
+
+def _weights(nodes: Array, line: Array, *, edge: bool) -> Array:
+    """Weights (m, n) of the values at nodes (n,) at places `line` (m,): a cubic spline through them.
+
+    With `edge` it goes through what the three next nodes foretell of the outermost two, each in a parabola.
+    The excess of those falls off as (1 - t)² within one interval: with the integral that Simpson's rule, by
+    which edge pressures carry their loads, gives them.
+    """
+    spline = np.asarray(make_interp_spline(nodes, np.eye(nodes.size), k=3)(line))
+    if not edge:
+        return spline
+    found = spline.copy()
+    for inward in (np.arange(4), nodes.size - 1 - np.arange(4)):
+        place, known = nodes[inward[0]], inward[1:]
+        excess = np.zeros(nodes.size)
+        excess[inward[0]] = 1.0
+        for one in known:
+            others = nodes[known[known != one]]
+            excess[one] = -np.prod((place - others) / (nodes[one] - others))
+        away = np.minimum(np.abs((line - place) / (nodes[known[0]] - place)), 1.0)
+        found += np.outer((1.0 - away) ** 2 - spline[:, inward[0]], excess)
+    return found
 
 
 def flat(width_mm: float, pressure_kPa: float, *, nodes: int = NODES) -> OpticalSurface:

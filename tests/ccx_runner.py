@@ -13,6 +13,7 @@ import numpy as np
 import pyvista as pv
 from debian_fetch import CCX
 from numpy.typing import NDArray
+from scipy.interpolate import RectBivariateSpline
 
 import fem
 from fem import ccx, surface
@@ -40,11 +41,14 @@ class Results:
 @dataclass(frozen=True)
 class Tared:
     """One level: largest tared displacement over the middle of the probe (µm), its integral over the whole
-    (mm³), force with and without inclusion (N), seconds of both runs; `scatter` is half the difference of the
-    last two settling steps, over the maximum."""
+    and up to `inner_mm` from the middle, without the outermost row of cells (mm³), force with and without
+    inclusion (N), seconds of both runs; `scatter` is half the difference of the last two settling steps, over
+    the maximum."""
 
     max_um: float
     total_mm3: float
+    inner_mm3: float
+    inner_mm: float
     force_N: float
     force_0_N: float
     scatter: float
@@ -100,15 +104,17 @@ def press(
     found = []
     for step in range(every - 1, every * len(levels), every):
         last = (step,) if every == 1 else (step - 1, step)
-        scalars = [
-            [tared(_surface(geometry, model, *(g[s] for g in grids)), m) for m in (True, False)] for s in last
-        ]
+        faces = [_surface(geometry, model, *(g[s] for g in grids)) for s in last]
+        scalars = [[tared(face, m) for m in (True, False)] for face in faces]
+        inner_mm = float(np.unique(np.round(faces[0].points[:, 0], 6))[-3])  # nodes in the middles of sides
         force = [1e-3 * share * -(r.reaction[list(last)] @ model.normal).mean() for r in both]
         top = [middle["max_mm"] for middle, _ in scalars]
         found.append(
             Tared(
                 1e3 * float(np.mean(top)),
                 float(np.mean([whole["total_mm3"] for _, whole in scalars])),
+                float(np.mean([total_within(face, inner_mm) for face in faces])),
+                inner_mm,
                 force[0],
                 force[1],
                 (max(top) - min(top)) / 2 / float(np.mean(top)),
@@ -129,6 +135,15 @@ def tared(contact: pv.PolyData, middle: bool) -> dict[str, float]:
         moved[away] = found["displacement_0"][away]
         found["displacement"] = moved
     return fem.scalars(found, 2.0)["tared"]
+
+
+def total_within(contact: pv.PolyData, half_mm: float) -> float:
+    """Integral of the tared displacement up to so far from the middle in x and y, mm³."""
+    tared = np.asarray(contact["displacement_0"])[:, 2] - np.asarray(contact["displacement"])[:, 2]
+    x, y = (np.unique(np.round(contact.points[:, k], 6)) for k in (0, 1))
+    order = np.lexsort((np.round(contact.points[:, 1], 6), np.round(contact.points[:, 0], 6)))
+    spline = RectBivariateSpline(x, y, tared[order].reshape(len(x), len(y)), kx=2, ky=2)
+    return float(spline.integral(-half_mm, half_mm, -half_mm, half_mm))
 
 
 def _symmetric(geometry: Geometry) -> tuple[bool, bool]:

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from test_simulate import small
 
-from scenes.traced import LIGHT
+from scenes.traced import BIAS_SINCE, LIGHT
 from twin import light_bias
 from twin.design import Design, load_design, parse_design
 from twin.fields import tables_of
@@ -40,7 +40,7 @@ CASES = {
 
 
 def test_the_data_are_todays_and_name_their_command() -> None:
-    assert DATA["light"] == LIGHT and "tests/test_standard_quality.py" in DATA["command"]
+    assert BIAS_SINCE <= DATA["light"] <= LIGHT and "tests/test_standard_quality.py" in DATA["command"]
     assert set(DATA["cases"]) == set(CASES)
 
 
@@ -89,7 +89,7 @@ def test_other_light_is_told_why(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "together" in light_bias.bias_of(mixed, "standard")["bias_of"]
     below = dataclasses.replace(design, leds=(dataclasses.replace(design.leds[0], side="below"),))
     assert "LEDs below" in light_bias.bias_of(below, "standard")["bias_of"]
-    monkeypatch.setattr(light_bias, "LIGHT", LIGHT + 1)
+    monkeypatch.setattr(light_bias, "BIAS_SINCE", LIGHT + 1)
     told = light_bias.bias_of(design, "standard")
     assert told["bias_percent"] is None and "earlier version" in told["bias_of"]
 

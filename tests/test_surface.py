@@ -72,6 +72,30 @@ def test_quadratic_fields_are_resampled_well() -> None:
     assert error[10:-10, 10:-10].max() < 1e-5 and error.max() < 3e-5  # of 0.03 mm
 
 
+def test_pressure_that_rises_at_the_edge_does_not_ring_and_keeps_its_force() -> None:
+    """p = 1 + s^-0.4 at the distance s from the edge, where nodes carry the load of the last cell."""
+    line = np.linspace(-HALF_MM, HALF_MM, 25)
+    cell = line[2] - line[0]
+    load = 1.0 + cell**-0.4 / 0.6  # mean over the last cell
+    inner = [1.0 + (HALF_MM - np.abs(at)) ** -0.4 for at in (line[1], line[2])]
+    value = 6.0 * load - 4.0 * inner[0] - inner[1]
+    distance = np.maximum(HALF_MM - np.abs(line), 1e-9)
+    along = np.where(distance < 1e-6, value, 1.0 + distance**-0.4)
+    surface = pressed(lambda x, y: 1.0 + 0.0 * x, lambda x, y: (0.0, 0.0, 0.0), cells=24)
+    at_node = np.abs(np.asarray(surface.points)[:, :1] - line).argmin(axis=1)
+    surface.point_data["pressure"] = along[at_node]
+    fine = resample(surface, WIDTH, nodes=601)
+    across, x = fine.pressure_kPa[300], fine.nodes_mm
+    np.testing.assert_allclose(fine.pressure_kPa, np.broadcast_to(across, (601, 601)), rtol=1e-12)
+    inside = np.abs(x) < HALF_MM - cell
+    true = 1.0 + (HALF_MM - np.abs(x[inside])) ** -0.4
+    assert np.abs(across[inside] / true - 1.0).max() < 0.003  # a plain spline: 0.009
+    simpson = np.tile([2.0, 4.0], 13)[:25]
+    simpson[[0, -1]] = 1.0
+    force = simpson @ along * cell / 6.0
+    assert np.trapezoid(across, x) == pytest.approx(force, rel=2e-3)
+
+
 def test_suffix_selects_the_press_without_inclusion() -> None:
     surface = pressed(lambda x, y: 2.0 + 0.0 * x, lambda x, y: (0.0, 0.0, -0.1))
     surface.point_data["pressure_0"] = np.full(surface.n_points, 1.5)

@@ -12,7 +12,7 @@ from functools import lru_cache
 from importlib.resources import files
 from typing import Any
 
-from scenes.traced import LIGHT
+from scenes.traced import BIAS_SINCE, LIGHT
 from twin.design import Design
 from twin.fields import tables_of
 
@@ -34,7 +34,7 @@ def bias_of(design: Design, quality: str, *, learned: bool = False) -> dict[str,
         return _none("reference light is what the other qualities are measured against")
     if learned:
         return _none("learned light was not measured")
-    if data["light"] != LIGHT:
+    if not BIAS_SINCE <= data["light"] <= LIGHT:
         return _none("measured for an earlier version of the light only")
     why = next(_unlike(design, data["alike"]), None)
     if why is not None:
