@@ -12,6 +12,7 @@ from fem.model import Inclusion, Layer, NotConverged, NotModelled, Pose, Probe, 
 from fem.scalars import scalars
 
 if TYPE_CHECKING:
+    from fem.background import on_background
     from fem.ccx import deck
     from fem.emulating import build_emulator
     from fem.emulator import Emulated, Emulator
@@ -36,6 +37,7 @@ __all__ = [
     "build_emulator",
     "deck",
     "load_emulator",
+    "on_background",
     "press",
     "press_2d",
     "press_moduli",
@@ -51,6 +53,7 @@ _LATER = {
     "Emulator": "emulator",
     "Press": "pressing",
     "deck": "ccx",
+    "on_background": "background",
     "build_emulator": "emulating",
     "load_emulator": "emulator_file",
     "press": "pressing",

@@ -341,7 +341,7 @@ def _press(
     seconds: float,
 ) -> Press:
     model = states[0].model
-    contact, lowest = _contact(geometry, states)
+    contact, lowest = contact_of(geometry, states)
     nodes, layout = model.nodes, model.layout
     faces, elements = surface.cut_faces(slab_topology(layout))
     probe_faces, probe_elements = surface.cut_faces(probe_topology(layout))
@@ -373,7 +373,7 @@ def _press(
     )
 
 
-def _contact(geometry: Geometry, states: tuple[State, State]) -> tuple[pv.PolyData, float]:
+def contact_of(geometry: Geometry, states: tuple[State, State]) -> tuple[pv.PolyData, float]:
     """The contact surface with its fields, and the smallest pressure on it, kPa."""
     nodes, half = states[0].model.nodes, states[0].model.layout.symmetric
     at = states[0].model.place[nodes.tip]

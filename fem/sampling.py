@@ -30,12 +30,13 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.stats import qmc
 
 from fem import mesh
+from fem.background import bare_geometry
 from fem.equilibrium import State
 from fem.mesh import Geometry
 from fem.meshed import build
 from fem.model import Inclusion, Length, Poisson, Probe, Slab, check
 from fem.path import Path, path
-from fem.pressing import _contact
+from fem.pressing import contact_of
 from fem.solver import one_thread
 from fem.topology import Resolution
 
@@ -288,9 +289,7 @@ def background(plan: Plan, thickness: float, tissue: float) -> dict[str, Floats]
     m, 3), displacement per mm of indentation.
     """
     res = plan.fine
-    # an inclusion that is left out gives every thickness the same lines
-    still = Inclusion(0.3 * plan.probe.width_mm, 0.2 * thickness, tissue)
-    geometry = Geometry(plan.probe, plan.slab(thickness, tissue), still)
+    geometry = bare_geometry(plan.probe, plan.slab(thickness, tissue))
     with one_thread():
         state = path(geometry, build(geometry, res, False), False).to(1.0)
         found = [_fields(geometry, (state, state))[:2]]
@@ -308,7 +307,7 @@ def background(plan: Plan, thickness: float, tissue: float) -> dict[str, Floats]
 
 def _fields(geometry: Geometry, states: tuple[State, State]) -> tuple[Floats, Floats, Floats, Floats]:
     """Pressure (n, n) and displacement (n, n, 3) on the whole footprint, of both states; kPa, mm."""
-    contact, _ = _contact(geometry, states)
+    contact, _ = contact_of(geometry, states)
     n = round(contact.n_points**0.5)
     data = contact.point_data
     return (

@@ -97,6 +97,7 @@ def export(
                 levels,
                 quality=quality,
                 estimate=False,
+                pictured=True,
                 progress=lambda stage, share: tell("mechanics", 0.8 * share),
             )
             tell("files", 0.8)

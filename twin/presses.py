@@ -43,6 +43,9 @@ MIN_FORCE_N = 1e-4
 _SURELY_TOO_MUCH = 2.0
 
 
+_OWN = 0.7  # share of the time that a press takes without its background
+
+
 def levels_of(
     design: Design, indentation: float | Sequence[float] | None, force: float | Sequence[float] | None
 ) -> tuple[list[float], bool, bool]:
@@ -97,9 +100,15 @@ def solved(
     by_force: bool = False,
     quality: Quality = "standard",
     estimate: bool = True,
+    pictured: bool = False,
     progress: Callable[[str, float], None] | None = None,
 ) -> list[Press]:
     """Return the presses by finite elements, one for each level, all found on one way down.
+
+    Parameters
+    ----------
+    pictured : surfaces stand on the background that all inclusions share (`fem.on_background`), without
+        their own mesh's ripples.
 
     Raises
     ------
@@ -108,6 +117,7 @@ def solved(
     """
     if by_force:
         _refuse_hopeless(design, levels)
+    own, tell = _OWN if pictured else 1.0, progress
     try:
         presses = fem.press(
             design.probe(),
@@ -119,8 +129,12 @@ def solved(
             tilt=design.press.tilt_deg,
             position=design.press.position_mm,
             estimate=estimate,
-            progress=progress,
+            progress=None if tell is None else lambda stage, share: tell(stage, own * share),
         )
+        if pictured:
+            if tell is not None:
+                tell("background", own)
+            presses = fem.on_background(presses)
     except ValueError as error:
         # what the mesh cannot follow comes as a plain ValueError in the same words
         if type(error) is ValueError and ": received " in str(error):

@@ -68,7 +68,7 @@ def pressed(plan: Plan, number: int) -> list[Contact]:
     if plan.mechanics == "emulator":
         found = presses.emulated(design, inclusion, levels, _emulator(str(plan.emulator)))
     else:
-        found = presses.solved(design, inclusion, levels, quality=plan.quality)
+        found = presses.solved(design, inclusion, levels, quality=plan.quality, pictured=True)
     return [
         Contact(press.surface, level, how_pressed(design, press), mechanics_facts(design, press))
         for level, press in zip(levels, found, strict=True)

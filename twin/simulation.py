@@ -186,6 +186,7 @@ def simulate(
             levels,
             by_force=by_force,
             quality=quality,
+            pictured=True,
             progress=lambda stage, share: work.tell("mechanics", share),
         )
     frames = []
@@ -203,7 +204,7 @@ def simulate(
 
 def _seconds(design: Design, levels: int) -> float:
     """About what the mechanics take."""
-    return 6.0 if design.mechanics == "linear" else 30.0 + 10.0 * levels
+    return 8.0 if design.mechanics == "linear" else 40.0 + 14.0 * levels
 
 
 def check(
