@@ -119,14 +119,29 @@ class Change:
 
 
 def crossed(sensor: Sensor) -> bool:
-    """Whether a face between layers crosses an LED's disc, so that its points count in whole numbers here and
-    there."""
-    ends = (
-        (led.z_mm - floor) / (led.diameter_mm / 2)
-        for led in sensor.leds
-        for floor in sensor.guide.floors_mm[:-1]
-    )
-    return any(abs(end) < 1.0 for end in ends)
+    """Whether a face between layers crosses an LED's disc."""
+    return any(map(len, _cuts(sensor)))
+
+
+def _cuts(sensor: Sensor) -> list[list[float]]:
+    """Heights on each LED's unit disc at which faces between layers cross it, falling."""
+    floors = sensor.guide.floors_mm[:-1]
+    heights = [[(floor - led.z_mm) / (led.diameter_mm / 2) for floor in floors] for led in sensor.leds]
+    return [[height for height in some if abs(height) < 1.0] for some in heights]
+
+
+def _rules(sensor: Sensor, points: int) -> tuple[Array, Array]:
+    """Points on the discs and their weights, LED after LED, as many for each."""
+    cuts = _cuts(sensor)
+    most = max(map(len, cuts))
+    if most == 0:
+        place, share = disc_rule(points)
+        return np.tile(place, (len(cuts), 1)), np.tile(share, len(cuts))
+    # a disc that is crossed less often is cut where it need not be
+    spare = np.linspace(0.9, -0.9, most + 2)[1:-1]
+    filled = [sorted([*some, *spare[: most - len(some)]], reverse=True) for some in cuts]
+    rules = [disc_rule(points * _FINER, some) for some in filled]
+    return np.concatenate([place for place, _ in rules]), np.concatenate([share for _, share in rules])
 
 
 def _targets(sensor: Sensor, ground: Array) -> tuple[mi.UInt32, list[mi.Float]]:
@@ -160,9 +175,10 @@ def _summed(
 ) -> list[mi.Float]:
     """Layers of weighted irradiance of each lane's target, over the points of its LED's disc."""
     steps = _NEWTON_LAYERS if sensor.guide.lower else _NEWTON_AGAIN
-    places, shares = disc_rule(points * (_FINER if crossed(sensor) else 1))
-    disc, share, end = floats(places), floats(shares), dr.opaque(mi.UInt32, len(shares))
-    weights, lanes = basis.weights(), dr.width(sources[0].number)
+    places, shares = _rules(sensor, points)
+    each = len(shares) // len(sensor.leds)
+    disc, share, end = floats(places), floats(shares), dr.opaque(mi.UInt32, each)
+    weights, first = basis.weights(), sources[0].number * each
     entered = [layer for layer in range(len(sources)) if _enters(sensor, layer)]
     families = [(layer, by_glass) for layer in entered for by_glass in (False, True)]
 
@@ -170,9 +186,9 @@ def _summed(
         return number < end
 
     def add(number, *state):  # type: ignore[no-untyped-def]
-        on_disc = dr.gather(mi.Point2f, disc, number)
-        onwards = dr.gather(mi.Point2f, disc, dr.minimum(number + 1, end - 1)) - on_disc
-        counts = dr.gather(mi.Float, share, number)
+        on_disc = dr.gather(mi.Point2f, disc, first + number)
+        onwards = dr.gather(mi.Point2f, disc, first + dr.minimum(number + 1, end - 1)) - on_disc
+        counts = dr.gather(mi.Float, share, first + number)
         slopes, total = [], list(state[len(families) :])
         for k, (layer, by_glass) in enumerate(families):
             flux, (cosine, d_x, d_y), slope = arrives(
@@ -183,8 +199,8 @@ def _summed(
             slopes.append(slope)
         return number + 1, *slopes, *total
 
-    first = dr.gather(mi.Point2f, disc, dr.zeros(mi.UInt32, lanes))
-    begin = [first_guess(sensor, sources[layer], first, here, by_glass) for layer, by_glass in families]
+    start = dr.gather(mi.Point2f, disc, first)
+    begin = [first_guess(sensor, sources[layer], start, here, by_glass) for layer, by_glass in families]
     state = (mi.UInt32(0), *begin, *(mi.Float(0.0) for _ in range(basis.layers)))
     return list(dr.while_loop(state, more, add))[1 + len(families) :]
 
