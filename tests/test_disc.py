@@ -43,7 +43,7 @@ def test_neighbours_follow_each_other() -> None:
 
 @pytest.mark.parametrize("cuts", [[0.3], [0.9, -0.4], [0.5, 0.0, -0.95]])
 def test_what_ends_at_a_height_is_right_where_the_rule_is_cut(cuts: list[float]) -> None:
-    """Mean of y above a cut, (2 / 3π)(1 - c²)^1.5; of all, 1 and 1/4. A rule that is not cut is 5 to 8 % off."""
+    """Mean of y above a cut, (2 / 3π)(1 - c²)^1.5; of all, 1 and 1/4. Without cuts it is 5 to 8 % off."""
     points, weights = disc_rule(384, cuts)
     x, y = points.T
     assert (np.hypot(x, y) < 1.0).all() and weights.sum() == pytest.approx(1.0, abs=1e-6)
