@@ -1,7 +1,7 @@
 """Presses told over plain tissue on a mesh that is the same for every inclusion.
 
 Towards the probe's edge the contact pressure is singular, and a mesh of a few cells there leaves ripples of
-one to seven per cent in it, other ones for every inclusion that the mesh is made around. They are the same
+some per cent in it, other ones for every inclusion that the mesh is made around. They are the same
 with the inclusion and without it: in the ratio of the two they cancel (a control variate). So the ratio is
 taken from the press's own mesh, plain tissue from one common mesh, and pictures of different inclusions
 differ by the inclusions alone.
