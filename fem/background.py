@@ -9,6 +9,7 @@ differ by the inclusions alone.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -29,6 +30,11 @@ from fem.topology import Resolution
 
 Floats = NDArray[np.float64]
 
+_OWN_MESH = (
+    "background: plain tissue could not be followed to {:g} mm on the mesh that all inclusions share; the "
+    "surface keeps the ripples of its own mesh, some per cent beside the guide's edges"
+)
+
 
 def bare_geometry(probe: Probe, slab: Slab, pose: Pose | None = None) -> Geometry:
     """Plain tissue, meshed around a sphere of its own moduli that gives every thickness the same lines on the
@@ -45,7 +51,8 @@ def on_background(presses: Sequence[Press]) -> list[Press]:
     `displacement` and `pressure` of the surface become those of plain tissue on the common mesh, the former
     plus what the inclusion adds, the latter times what it multiplies it by; it has that mesh's nodes. All
     else, forces too, stays that of the press's own mesh. Where contact has opened anywhere, as it does under
-    domes and most tilted probes, presses are returned as they are.
+    domes and most tilted probes, presses are returned as they are (`Press.path` tells it); and, with a
+    warning, where plain tissue cannot be followed as deep on the common mesh.
     """
     if not presses or not all(one.path != "unilateral" and one.min_pressure_kPa > 0 for one in presses):
         return list(presses)
@@ -55,6 +62,7 @@ def on_background(presses: Sequence[Press]) -> list[Press]:
     levels = tuple(sorted({one.indentation_0_mm for one in presses}))
     grounds = _grounds(geometry, res, first.mechanics == "finite", levels)
     if grounds is None:
+        warnings.warn(_OWN_MESH.format(levels[-1]), stacklevel=2)
         return list(presses)
     at = dict(zip(levels, grounds, strict=True))
     return [replace(one, surface=_over(one.surface, at[one.indentation_0_mm])) for one in presses]

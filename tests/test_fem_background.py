@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import fem
+from fem import background
 from fem.background import bare_geometry
 from fem.sampling import lines
 
@@ -77,3 +78,17 @@ def test_presses_that_open_are_returned_as_they_are(large: fem.Press) -> None:
     opened = replace(large, path="unilateral")
     assert fem.on_background([opened])[0].surface is opened.surface
     assert fem.on_background([]) == []
+
+
+def test_a_press_without_the_common_background_is_told(
+    large: fem.Press, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stuck(*_: object) -> None:
+        raise background.NotConverged("press: no equilibrium at 1 mm")
+
+    background._grounds.cache_clear()
+    monkeypatch.setattr(background, "path", stuck)
+    with pytest.warns(UserWarning, match="could not be followed to 1 mm"):
+        (found,) = fem.on_background([large])
+    assert found.surface is large.surface
+    background._grounds.cache_clear()

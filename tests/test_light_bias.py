@@ -7,9 +7,13 @@ import json
 from importlib.resources import files
 from typing import Any
 
+import numpy as np
 import pytest
+from scipy.interpolate import RectBivariateSpline
+from sensors import bump
 from test_simulate import small
 
+from scenes.surface import resample
 from scenes.traced import BIAS_SINCE, LIGHT
 from twin import light_bias
 from twin.design import Design, load_design, parse_design
@@ -42,6 +46,19 @@ CASES = {
 def test_the_data_are_todays_and_name_their_command() -> None:
     assert BIAS_SINCE <= DATA["light"] <= LIGHT and "tests/test_standard_quality.py" in DATA["command"]
     assert set(DATA["cases"]) == set(CASES)
+
+
+def test_what_changed_since_it_was_measured_does_not_touch_it() -> None:
+    """Since then pressures beside the guide's edge come to the optical grid otherwise (`LIGHT` 6): the
+    surface that the bias was measured on is smooth there, and came to it by a plain spline. The domed one is
+    made on the grid."""
+    pressed = bump()
+    x, y = (np.unique(np.round(pressed.points[:, k], 9)) for k in (0, 1))
+    order = np.lexsort((pressed.points[:, 1], pressed.points[:, 0]))
+    pressure = np.asarray(pressed["pressure"])[order].reshape(x.size, y.size)
+    fine = resample(pressed, x[-1] - x[0])
+    before = RectBivariateSpline(x, y, pressure, s=0)(fine.nodes_mm, fine.nodes_mm).T
+    np.testing.assert_allclose(fine.pressure_kPa, before, rtol=1e-5)
 
 
 @pytest.mark.parametrize("quality", ["standard", "preview"])
