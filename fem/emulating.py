@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fem.emulator import CENTRED, Emulator, amplitudes, features, lagrange, resample
-from fem.emulator_errors import Errors
+from fem.emulator_errors import Errors, off_the_edge
 from fem.regression import Regression, regress
 from fem.sampling import Plan, contrast, geometry_at
 from fem.solver import one_thread
@@ -317,12 +317,13 @@ def _errors(known: _Known, fits: _Fits, numbers: NDArray[np.int64]) -> Floats:
 
 def _missed(miss: Floats, true: Floats, x: Floats) -> tuple[float, float, float]:
     """Largest error off the probe's edge, root mean square over the area, and largest error with the edge,
-    the worst of all cases, per cent of the true field's maximum; fields (cases, m, m) on lines x."""
+    the worst of all cases, per cent of the true field's maximum off it; fields (cases, m, m) on lines x."""
     area = np.outer(line_weights(x), line_weights(x)) / (x[-1] - x[0]) ** 2
-    top, size = np.abs(true).max(axis=(1, 2)), np.abs(miss)
+    inner, size = off_the_edge(x), np.abs(miss)
     mean = np.sqrt((miss**2 * area).sum(axis=(1, 2)))
-    inner = size[:, 1:-1, 1:-1].max(axis=(1, 2))
-    return tuple(float(100 * (part / top).max()) for part in (inner, mean, size.max(axis=(1, 2))))  # type: ignore[return-value]
+    top = np.abs(true)[:, inner].max(axis=1)
+    parts = (size[:, inner].max(axis=1), mean, size.max(axis=(1, 2)))
+    return tuple(float(100 * (part / top).max()) for part in parts)  # type: ignore[return-value]
 
 
 def _curve(known: _Known) -> Floats:

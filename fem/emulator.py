@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from fem import surface
-from fem.contact import recovery
 from fem.emulator_errors import Errors
 from fem.emulator_limits import check, within
 from fem.mesh import Geometry
@@ -171,8 +170,11 @@ class Emulator:
 def fields(emulator: Emulator, slab: Slab, inclusion: Inclusion | None, depth: float) -> dict[str, Floats]:
     """The fields of `Emulated.surface` on the grid, (m, m) and (m, m, 3), at an indentation in mm."""
     found = fields_of(emulator, [(slab, inclusion, (depth,))])[0][0]
+    x, still = emulator.x, np.zeros_like(found["displacement"])
     areas = {
-        f"area{suffix}": _area(emulator.x, found["displacement" + suffix], emulator.plan.finite)
+        f"area{suffix}": surface.areas(
+            x, x, found["displacement" + suffix] if emulator.plan.finite else still
+        )
         for suffix in ("", "_0")
     }
     return {**found, **areas}
@@ -353,21 +355,6 @@ def lagrange(nodes: Floats, at: float) -> Floats:
     return np.asarray(shares.prod(axis=1))
 
 
-def _area(x: Floats, moved: Floats, finite: bool) -> Floats:
-    """Lumped area of each node (m, m), mm², on the deformed surface seen along z."""
-    lumped, slope = _weights(tuple(x))
-    if not finite:
-        return lumped
-    dx, dy = np.tensordot(slope, moved[..., :2], 1), np.einsum("jk,ikc->ijc", slope, moved[..., :2])
-    return np.asarray(lumped * ((1 + dx[..., 0]) * (1 + dy[..., 1]) - dx[..., 1] * dy[..., 0]))
-
-
 @lru_cache(maxsize=4)
 def _grid(x: tuple[float, ...]) -> pv.PolyData:
     return surface.contact_surface(np.array(x), np.array(x))
-
-
-@lru_cache(maxsize=4)
-def _weights(x: tuple[float, ...]) -> tuple[Floats, Floats]:
-    along = np.array(x)
-    return np.outer(surface.line_weights(along), surface.line_weights(along)), recovery(along)

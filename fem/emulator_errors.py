@@ -9,21 +9,30 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
+EDGE = 1.0
+"""How wide the probe's edge is, where errors count apart, mm."""
+
+
+def off_the_edge(x: Floats) -> NDArray[np.bool_]:
+    """Which nodes of a grid with lines x (m,), mm, lie off the probe's edge, (m, m)."""
+    inner = np.abs(x) <= x[-1] - EDGE
+    return np.logical_and.outer(inner, inner)
+
 
 @dataclass(frozen=True)
 class Errors:
     """Errors of the samples within the ranges, each left out of what was fitted, in per cent of the field's
-    own maximum.
+    own maximum off the probe's edge.
 
     `pressure` and `displacement` are of the tared fields, the worst of all levels and moduli solved: largest
-    off the probe's edge, root mean square over the area, and largest at all nodes, (n, 3). On the edge itself
-    the pressure is singular: what is found there depends on the mesh, and at finite strain scatters by some
-    per cent. `size_mm` (n,) is the inclusion's. `finer` (p, 3): the same of what a finer mesh adds to the
-    tared pressure. `curve` (rows, 9): number of samples at small and at finite strain, core seconds they
-    took, and of a common set of held-out samples with `size_mm` >= 4 the median and the 95th percentile of
-    each of the pressure's three errors. `solves` (3, 2): of samples, of pairs of a fine and a lean mesh, and
-    of samples at finite strain, how many were tried, and how many of them failed and are missing from all
-    this.
+    off the probe's edge (its outermost millimetre), root mean square over the area, and largest at all nodes,
+    (n, 3). At the edge the pressure is singular: what is found there depends on the mesh, and at finite
+    strain scatters by some per cent. `size_mm` (n,) is the inclusion's. `finer` (p, 3): the same of what a
+    finer mesh adds to the tared pressure. `curve` (rows, 9): number of samples at small and at finite strain,
+    core seconds they took, and of a common set of held-out samples with `size_mm` >= 4 the median and the
+    95th percentile of each of the pressure's three errors. `solves` (3, 2): of samples, of pairs of a fine
+    and a lean mesh, and of samples at finite strain, how many were tried, and how many of them failed and are
+    missing from all this.
     """
 
     size_mm: Floats

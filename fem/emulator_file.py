@@ -22,7 +22,7 @@ from fem.solving import KNOTS
 
 Floats = NDArray[np.float64]
 
-_FORMAT = 4
+_FORMAT = 5
 _LARGEST = 512 * 2**20  # bytes of all arrays
 _REGRESSIONS = ("rise", "tared", "finer")
 _MORE = ("rise_more", "tared_more")  # that finite strain has besides

@@ -30,8 +30,9 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.stats import qmc
 
 from fem import mesh
-from fem.background import bare_geometry
 from fem.equilibrium import State
+from fem.ground import bare_geometry, ground
+from fem.ground import lines as grid_lines
 from fem.mesh import Geometry
 from fem.meshed import build
 from fem.model import Inclusion, Length, Poisson, Probe, Slab, check
@@ -58,7 +59,7 @@ COARSE = Resolution(
 """Mesh of what finite strain adds."""
 
 FINE = mesh.QUALITIES["standard"]
-"""Mesh of the background and of what makes up for the lean one; its surface is that of the answers."""
+"""Mesh of what makes up for the lean one, and of what the background goes with (`fem.ground.fine`)."""
 
 
 def contrast(ratio: Floats) -> Floats:
@@ -288,21 +289,20 @@ def background(plan: Plan, thickness: float, tissue: float) -> dict[str, Floats]
     Lines `x` (m,); `pressure` (levels, m, m) per kPa of the tissue and mm of indentation; `moved` (levels, m,
     m, 3), displacement per mm of indentation.
     """
-    res = plan.fine
-    geometry = bare_geometry(plan.probe, plan.slab(thickness, tissue))
-    with one_thread():
-        state = path(geometry, build(geometry, res, False), False).to(1.0)
-        found = [_fields(geometry, (state, state))[:2]]
-        if plan.finite:
-            bare = path(geometry, build(geometry, res, True), False)
-            for level in plan.levels[1:]:
-                state = bare.to(float(level))
-                found.append(tuple(f / level for f in _fields(geometry, (state, state))[:2]))
-    return {
-        "x": lines(geometry, res)[0],
-        "pressure": np.stack([f[0] for f in found]) / tissue,
-        "moved": np.stack([f[1] for f in found]),
-    }
+    geometry, levels = (
+        bare_geometry(plan.probe, plan.slab(thickness, tissue)),
+        tuple(plan.levels[1:].tolist()),
+    )
+    found = [(1.0, *ground(geometry, plan.fine, False, (1.0,)))]
+    if plan.finite:
+        found += zip(levels, ground(geometry, plan.fine, True, levels), strict=True)
+    x = grid_lines(found[0][1])[0]
+    pressure, moved = (
+        np.stack([np.asarray(surface[name], dtype=float) / level for level, surface in found])
+        for name in ("pressure", "displacement")
+    )
+    shape = (len(found), x.size, x.size)
+    return {"x": x, "pressure": pressure.reshape(shape) / tissue, "moved": moved.reshape(*shape, 3)}
 
 
 def _fields(geometry: Geometry, states: tuple[State, State]) -> tuple[Floats, Floats, Floats, Floats]:

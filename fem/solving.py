@@ -28,7 +28,7 @@ class NotBuilt(ValueError):
     """An emulator that cannot be built from what there is: one line says why."""
 
 
-_FORMAT = 2  # of the files in a folder
+_FORMAT = 3  # of the files in a folder
 SHARE = 8  # samples for each pair of a fine and a lean mesh
 STRETCHED = 3  # samples for each one at finite strain, which is the same specimen as an earlier one
 _FIRST = 16  # pairs that come with one sample each

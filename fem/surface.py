@@ -11,6 +11,7 @@ from scipy.sparse.linalg import spsolve
 from skfem import ElementHex2, MeshHex2
 
 from fem import edge
+from fem.contact import recovery
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -45,6 +46,14 @@ def line_weights(x: Floats) -> Floats:
     weights[1:-1:2] += lengths * 4 / 6
     weights[2::2] += lengths / 6
     return weights
+
+
+def areas(x: Floats, y: Floats, moved: Floats) -> Floats:
+    """Lumped area of each node (nx, ny), mm², on the deformed surface seen along z; moved (nx, ny, 3) mm."""
+    dx = np.tensordot(recovery(x), moved[..., :2], 1)
+    dy = np.einsum("jk,ikc->ijc", recovery(y), moved[..., :2])
+    stretch = (1 + dx[..., 0]) * (1 + dy[..., 1]) - dx[..., 1] * dy[..., 0]
+    return np.asarray(np.outer(line_weights(x), line_weights(y)) * stretch)
 
 
 _CONSISTENT = np.array([[4.0, 2.0, -1.0], [2.0, 16.0, 2.0], [-1.0, 2.0, 4.0]]) / 30

@@ -9,7 +9,7 @@ import pytest
 
 import fem
 from fem import background
-from fem.background import bare_geometry
+from fem.ground import bare_geometry, fine
 from fem.sampling import lines
 
 PROBE = fem.Probe(25, (fem.Layer(2, 27), fem.Layer(3, 61), fem.Layer(5, 156)))
@@ -51,7 +51,7 @@ def test_plain_tissue_is_the_same_under_all_inclusions(large: fem.Press, small: 
     shared = [fem.on_background([one])[0] for one in (large, small)]
     for name in ("pressure_0", "displacement_0", "area_0"):
         np.testing.assert_array_equal(shared[0].surface[name], shared[1].surface[name])
-    expected = lines(bare_geometry(PROBE, SLAB), small._states[0].model.layout.res)[0]
+    expected = lines(bare_geometry(PROBE, SLAB), fine(small._states[0].model.layout.res))[0]
     np.testing.assert_allclose(np.unique(np.round(shared[0].surface.points[:, 0], 6)), expected, atol=1e-6)
 
 
@@ -86,9 +86,7 @@ def test_a_press_without_the_common_background_is_told(
     def stuck(*_: object) -> None:
         raise background.NotConverged("press: no equilibrium at 1 mm")
 
-    background._grounds.cache_clear()
-    monkeypatch.setattr(background, "path", stuck)
+    monkeypatch.setattr(background, "ground", stuck)
     with pytest.warns(UserWarning, match="could not be followed to 1 mm"):
         (found,) = fem.on_background([large])
     assert found.surface is large.surface
-    background._grounds.cache_clear()

@@ -13,6 +13,7 @@ from numpy.lib.format import write_array
 import fem
 from fem.emulating import build_emulator, fit
 from fem.emulator import Emulator, lagrange, resample, signals
+from fem.emulator_errors import off_the_edge
 from fem.emulator_file import NotAnEmulator, load_emulator, save_emulator
 from fem.emulator_limits import check
 from fem.regression import Regression, regress
@@ -101,7 +102,8 @@ def test_held_out_solves_are_met(emulator: Emulator) -> None:
             1,
         )
         true = onto[0] @ truth @ onto[1].T * unit
-        errors.append(100 * np.abs(guess * unit - true).max() / np.abs(true).max())
+        missed, size = (np.abs(f)[off_the_edge(emulator.x)] for f in (guess * unit - true, true))
+        errors.append(100 * missed.max() / size.max())
     assert np.median(errors) < 2 * emulator.errors.percentile("pressure", 50) < 4.0
     assert max(errors) < 2 * emulator.errors.percentile("pressure", 95)
 
