@@ -20,7 +20,7 @@ from twin.emulate import plan_of
 MINUTES, WORKERS = 30.0, 2
 MEDIAN_PERCENT, HIGH_PERCENT = 1.0, 4.0
 """Goal for the largest error of the tared pressure over its maximum, of held-out inclusions of 4 mm and more:
-on the whole surface; it is met off the probe's outermost nodes only."""
+on the whole surface; it is met off the face's outermost millimetre only."""
 FAILED_PERCENT = 2.0  # of the solves that may be missing
 
 UNSEEN = {"standard": 4, "preview": 2}
