@@ -4,7 +4,8 @@ twin corpus plan phantoms --seed 5 --out corpora/phantoms
 twin corpus plan phantoms --seed 5 --mechanics emulator --emulator emulators/tsis.npz \\
     --traced emulators/tsis.light.npz --light preview --out corpora/emulated
 twin corpus run corpora/phantoms; twin corpus run corpora/emulated
-TWIN_SOLVED=corpora/phantoms TWIN_EMULATED=corpora/emulated pytest -m slow -s tests/bench/test_same_pictures.py
+TWIN_SOLVED=corpora/phantoms TWIN_EMULATED=corpora/emulated \\
+    pytest -m slow -s tests/bench/test_same_pictures.py
 """
 
 import os
@@ -34,9 +35,7 @@ def test_the_same_specimens_look_the_same() -> None:
     solved, emulated = (twin.Corpus(os.environ[name]) for name in ("TWIN_SOLVED", "TWIN_EMULATED"))
     for drawn in ("size_mm", "specimen.modulus_kPa", "camera.gain_e_per_dn"):
         np.testing.assert_array_equal(*(corpus.table[drawn] for corpus in (solved, emulated)))
-    print(
-        "sample, level | tared picture, counts: largest; rms and largest difference | pressure, rms difference, %"
-    )
+    print("sample, level | tared, counts: largest; rms and largest difference | pressure, rms difference, %")
     apart, pressed = [], []
     for sample in map(int, solved.samples):
         for level in range(solved.levels):
