@@ -31,6 +31,10 @@ Floats = NDArray[np.float64]
 
 _GROWTH = (0.7, 1.6)  # of the fine mesh's cells towards the probe's edge, and beyond it
 _LEAN_GROWTH = (0.6, 1.6)
+_DEEP, _DEEP_GROWTH = (
+    0.12,
+    (2.0, 1.6),
+)  # strain from which that is: such cells give way later, and ripple more
 _DEGREE = 4  # of the share of finite strain, along x and y
 _WITHIN = (
     0.91  # of the probe's half width, where it is learned: beyond, cells of the lean mesh tell of themselves
@@ -63,10 +67,10 @@ def fine(res: Resolution) -> Resolution:
     )
 
 
-def lean(res: Resolution) -> Resolution:
+def lean(res: Resolution, growth: tuple[float, float]) -> Resolution:
     """Mesh of what finite strain changes."""
     return Resolution(
-        min(res.arc, 2), 1, 1, min(res.above, 2), 1, min(res.arc + 1, 3), min(res.side, 2), 1, 1, _LEAN_GROWTH
+        min(res.arc, 2), 1, 1, min(res.above, 2), 1, min(res.arc + 1, 3), min(res.side, 2), 1, 1, growth
     )
 
 
@@ -99,10 +103,12 @@ def ground(
     small = _pressed(geometry, fine(res), False, levels)
     if not finite:
         return small
+    deep = levels[-1] > _DEEP * geometry.slab.thickness_mm
+    coarse = lean(res, _DEEP_GROWTH if deep else _LEAN_GROWTH)
     changed = zip(
         small,
-        _pressed(geometry, lean(res), False, levels),
-        _pressed(geometry, lean(res), True, levels),
+        _pressed(geometry, coarse, False, levels),
+        _pressed(geometry, coarse, True, levels),
         strict=True,
     )
     return tuple(_strained(*each) for each in changed)
