@@ -141,3 +141,18 @@ def test_press_by_force() -> None:
     assert answer.force_N == pytest.approx(0.2, rel=2e-6)
     assert answer.force_0_N == pytest.approx(0.2, rel=2e-6)
     assert answer.indentation_mm < answer.indentation_0_mm
+
+
+@pytest.mark.slow
+def test_nearly_incompressible_tissue_does_not_lock() -> None:
+    """To first order in 1 - 2 nu what compressibility changes is proportional to it: signal and force go to
+    those of incompressible tissue. Elements that lock would be stiffer the nearer nu is to a half."""
+    found = []
+    for poisson in (0.49, 0.499, 0.4999):
+        slab = fem.Slab(30, 60, 5, poisson=poisson)
+        answer = fem.press(PROBE, slab, BALL, 1.0, quality="preview", estimate=False)
+        found.append((1e3 * tared(answer).max(), answer.force_N))
+        print(f"Poisson {poisson:g}: tared maximum {found[-1][0]:.3f} µm, force {found[-1][1]:.4f} N")
+    values = np.array(found)
+    limit = values[2] + (values[2] - values[1]) / 9  # 1 - 2 nu falls by ten from one to the next
+    np.testing.assert_allclose((limit - values[0]) / (limit - values[1]), 10.0, rtol=0.15)
