@@ -9,6 +9,7 @@ likelihood, the trend and each mode's variance are solved for.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,9 +54,16 @@ class Regression:
     def __call__(self, inputs: Floats) -> Floats:
         """Fields (p, m) at inputs (p, q)."""
         found = _trend(inputs) @ self.trend
-        for group, scales in zip(groups(len(self.modes)), self.lengths, strict=True):
-            found[:, group] += _covariance(inputs / scales, self.inputs / scales) @ self.weights[:, group]
+        near = _covariance(inputs / self.lengths[:, None], *self._nodes)
+        for group, covariance in zip(groups(len(self.modes)), near, strict=True):
+            found[:, group] += covariance @ self.weights[:, group]
         return np.asarray(self.mean + found @ self.modes)
+
+    @cached_property
+    def _nodes(self) -> tuple[Floats, Floats]:
+        """The samples' inputs over each group's lengths, (g, n, q), and their squares' sums, (g, n)."""
+        scaled = self.inputs / self.lengths[:, None]
+        return scaled, (scaled**2).sum(axis=-1)
 
 
 def groups(modes: int) -> list[slice]:
@@ -64,9 +72,15 @@ def groups(modes: int) -> list[slice]:
     return [slice(a, b) for a, b in zip(starts, [*starts[1:], modes], strict=True)]
 
 
-def _covariance(a: Floats, b: Floats) -> Floats:
-    square = (a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1) - 2 * a @ b.T
-    return np.asarray(np.exp(-0.5 * np.maximum(square, 0.0)))
+def _covariance(a: Floats, b: Floats, squares: Floats | None = None) -> Floats:
+    """Of scaled inputs (..., p, q) and (..., n, q), whose squares' sums may be known, (..., p, n)."""
+    if squares is None:
+        squares = (b**2).sum(axis=-1)
+    square = a @ (2.0 * np.swapaxes(b, -1, -2))
+    square -= (a**2).sum(axis=-1)[..., None]
+    square -= squares[..., None, :]
+    np.minimum(square, 0.0, out=square)
+    return np.asarray(np.exp(np.multiply(square, 0.5, out=square), out=square))
 
 
 def _trend(inputs: Floats) -> Floats:

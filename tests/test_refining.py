@@ -139,6 +139,70 @@ def test_intervals_cover_what_they_say() -> None:
     assert np.all(np.abs(share - 0.9) < 3.0 * np.sqrt(0.09 / 120)), share
 
 
+def test_quick_pictures_tell_the_same_valley(monkeypatch: pytest.MonkeyPatch) -> None:
+    """References apart, and quick pictures off by a hundred times the noise, the same for all: the posterior
+    is that of whole ones; where references change, whole pictures are taken."""
+
+    def pair(seen: NDArray[np.float64]) -> NDArray[np.float32]:
+        """What is seen without an inclusion, which hangs on the gain alone, beside all of it."""
+        plain = np.broadcast_to(seen[..., 6:7], seen.shape)
+        return np.stack([seen, plain], axis=-1)[..., None, None].astype(np.float32)
+
+    def expected(chain: Any, prior: Prior, many: Any, near: Any = None) -> NDArray[Any]:
+        seen = pair(light_map(np.array(many)))
+        return seen if near is None else seen + near.of(many)
+
+    class Both(Features):
+        def __call__(self, pictures: NDArray[Any]) -> NDArray[Any]:
+            return np.asarray(pictures).reshape(-1, K, 2)[..., 0]
+
+    for module in (fitting, refining):
+        monkeypatch.setattr(module, "expected", expected)
+    x, looks = np.array([7.0, 6.0, 85.0, 0.3, -0.2, 0.4]), []
+
+    def unknowns(values: Mapping[str, float]) -> NDArray[np.float64]:
+        return np.array([*(values[name] for name in PARAMETERS), values["gain"] / 0.02])
+
+    def whole(values: Mapping[str, float]) -> NDArray[np.float32]:
+        looks.append("whole")
+        return pair(truth(unknowns(values)))
+
+    def quick(values: Mapping[str, float]) -> NDArray[np.float32]:
+        looks.append("quick")
+        return pair(truth(unknowns(values)))[:, :1] + np.float32(100 * NOISE)
+
+    features: Any = Both()
+    told = truth(x) + NOISE * np.random.default_rng(5).standard_normal(K)
+    start = x + np.array([0.4, -0.3, -5.0, 0.0, 0.0, 0.0])
+    parts = (CHAIN, features, PRIOR, np.eye(K) * 0.15**2, told, 1.0, start)
+    monkeypatch.setattr(refining, "_ALIKE", 1.0)
+    one = refining.refine(*parts, whole, seed=5)
+    looks.clear()
+    other = refining.refine(*parts, whole, quick=quick, seed=5)
+    assert looks.count("quick") > looks.count("whole") > 0
+    np.testing.assert_allclose(other.samples, one.samples, rtol=1e-3, atol=1e-3)
+    monkeypatch.setattr(refining, "_ALIKE", 0.0)
+    looks.clear()
+    refining.refine(*parts, whole, quick=quick, seed=5)
+    assert looks.count("quick") == 0
+
+
+@pytest.mark.parametrize("modulus", [60.0, 95.0])
+def test_a_good_map_needs_no_rendering(modulus: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Off by a tenth of the noise, and known to be: the posterior is that by rendering; off by more, it is
+    rendered."""
+    x = np.array([7.0, 6.0, modulus, 0.3, -0.2, 0.4])
+    rough = light_map
+    monkeypatch.setitem(globals(), "light_map", lambda x: truth(x) + 0.02 * (rough(x) - truth(x)))
+    found = refined(x, 1.0, seed=5, error=0.1 * NOISE)
+    assert found.renders == 0 and found.explains
+    rendered = refined(x, 1.0, seed=5)
+    assert rendered.renders > 0
+    one, other = found.samples[:, :3], rendered.samples[:, :3]
+    assert np.all(np.abs(one.mean(axis=0) - other.mean(axis=0)) < 0.15 * other.std(axis=0))
+    assert np.all(np.abs(one.std(axis=0) / other.std(axis=0) - 1.0) < 0.1)
+
+
 def test_what_cannot_be_rendered_is_not_explained() -> None:
     features: Any = Features()
     x = np.array([9.0, 6.0, 80.0, 0.3, -0.2, 0.0])

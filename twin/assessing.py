@@ -187,7 +187,7 @@ def answer(task: Task) -> None:
         with suppress(fem.NotModelled):
             parts = ablation.bounds(estimator.chain, estimator.prior, values)
             row["parts"] = {name: sd.tolist() for name, sd in parts.items()}
-    near = None
+    near, start = None, None
     for frames in FRAMES:
         if frames == 1:
             seen = stored(estimator, source, task.number, levels)
@@ -207,11 +207,13 @@ def answer(task: Task) -> None:
         except fem.NotModelled:
             found["bound"] = found["deflection"] = None
         if task.rendered and estimator.traced:
+            begins = drawn.mean(axis=0) if start is None else start
             refined = estimator.refined(
-                seen, frames, drawn.mean(axis=0), samples=_DRAWS, seed=task.seed, begin=near, threads=1
+                seen, frames, begins, samples=_DRAWS, seed=task.seed, begin=near, threads=1
             )
             if refined is not None:
-                near = refined.near
+                start = refined.fitted.x[: drawn.shape[1]]
+                near = refined.near if refined.renders else None
                 found["misfit"] = refined.fitted.chi_square / len(estimator.sight.features.spread)
                 found["renders"], found["explains"] = refined.renders, refined.explains
             if refined is not None and refined.explains:

@@ -141,7 +141,7 @@ def coarse_charges(design: Design, layers: NDArray[np.floating]) -> Single:
     return np.stack([retake.average(whole_blocks(one), BLOCK) for one in pixels])
 
 
-def whole_blocks(picture: NDArray[np.floating]) -> Single:
+def whole_blocks(picture: NDArray[np.floating], block: tuple[int, int] = BLOCK) -> Single:
     """Leave out rows and columns beyond the last whole block."""
-    rows, columns = (side // block * block for side, block in zip(picture.shape, BLOCK, strict=True))
+    rows, columns = (side // size * size for side, size in zip(picture.shape, block, strict=True))
     return np.asarray(picture[:rows, :columns], np.float32)

@@ -25,7 +25,7 @@ _UNKNOWN = 0.8
 _METHODS = {
     "rendered": "refined by rendering the most probable inclusion",
     "network": "by the network alone",
-    "fitted": "by the most probable inclusion of the calibrated chain, without rendering",
+    "fitted": "by the light that was learned, without rendering: its error is known and small here",
 }
 _WORDS = {"size_mm": ("size", "mm"), "depth_mm": ("depth", "mm"), "modulus_kPa": ("modulus", "kPa")}
 

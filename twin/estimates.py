@@ -29,8 +29,8 @@ class Estimate:
     observed : (levels, r, c) tared counts of the coarse picture that was seen.
     predicted : (levels, r, c) the same as expected at the posterior mean.
     noise : (levels, r, c) standard deviation of observed minus predicted, counts.
-    method : where the samples come from: "rendered" (`twin.refining`), "network", or "fitted" of a calibrated
-        model, whose network does not know of the calibration.
+    method : where the samples come from: "rendered" (`twin.refining`), "fitted" where learned light does as
+        well, or in a calibrated model, whose network does not know of the calibration; else "network".
     misfit : chi-square of the predicted pictures over its number of features; near 1 where the model can make
         these pictures.
     """

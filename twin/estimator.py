@@ -97,7 +97,7 @@ class Estimator:
         fitted = self.fitted(seen, frames, drawn.mean(axis=0)) if refined is None else refined.fitted
         method, answer = "network", drawn
         if refined is not None and refined.explains:
-            method, answer = "rendered", refined.samples
+            method, answer = "rendered" if refined.renders else "fitted", refined.samples
         elif self.calibration is not None:
             method, answer = "fitted", self.normal(fitted, samples, seed)
         wanted = answer[:, : len(NAMES)]
@@ -148,6 +148,11 @@ class Estimator:
         them, from a start (5,); None where the learned light does not know the best fit."""
         prior = prior or self.prior
         sight = self.sight if blocks is None else self.sight.only(blocks)
+
+        def pictures(values: Mapping[str, float], quick: bool = False) -> Single:
+            values = reachable(self.chain, dict(values))
+            return render(self.chain, self.traced, values, threads=threads, quick=quick)
+
         try:
             return refine(
                 self.chain,
@@ -157,9 +162,8 @@ class Estimator:
                 sight.features(seen[None])[0],
                 frames,
                 np.concatenate([start, np.zeros(prior.basis.shape[1])]),
-                lambda values: render(
-                    self.chain, self.traced, reachable(self.chain, dict(values)), threads=threads
-                ),
+                pictures,
+                quick=lambda values: pictures(values, quick=True),
                 samples=samples,
                 seed=seed,
                 begin=begin,

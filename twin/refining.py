@@ -2,7 +2,8 @@
 
 The network and the chain know the light only by a light map, whose errors are as large as the noise of one
 exposure. So the most probable specimen is rendered, what the map is off there is taken out of the pictures,
-and the fit goes on; where it ends, the map's own error no longer matters to first order. What remains unknown
+and the fit goes on; where it ends, the map's own error no longer matters to first order. Where that error is
+so far below the noise that it does not widen the posterior, nothing is rendered. What remains unknown
 lies along a narrow, bent valley: a stiffer inclusion that is a little smaller looks nearly the same. It is
 followed from modulus to modulus, all else most probable and normal around it at each (Laplace's method for
 marginals: Tierney and Kadane 1986, [tierney1986]). At each of these moduli the specimen is rendered again: a
@@ -21,7 +22,7 @@ from scipy.interpolate import CubicSpline, interp1d
 
 from estimation.features import Features
 from twin.chain import Chain
-from twin.fitting import Fitted, Near, Prior, covariance, expected, fit, inside, jacobian, placed
+from twin.fitting import ALIGNMENT, Fitted, Near, Prior, covariance, expected, fit, inside, jacobian, placed
 
 Floats = NDArray[np.float64]
 Single = NDArray[np.float32]
@@ -31,8 +32,10 @@ _STILL = 0.1  # standard deviations that do not matter
 _FIRST, _NEAR = 0.3, 1.0
 """Standard deviations that a fit may move after the first rendering, and after one that tells how the map's
 error changes, without another."""
+_ALIKE = 0.1  # counts rms, that references are apart whose difference from the map's is the same
 _SHORT = 1e-3  # of the prior's spread: a way that tells nothing of how the error changes
 _REMAINS = 0.05  # of the map's error after its correction nearby (see `tests/test_refining.py`)
+_AS_WELL = 1.05  # times wider by the map's error a posterior may be without any rendering
 _STRANGE = 1e-4  # chance of a misfit, below which the noise is taken to be louder than told
 _LOUDEST = 10.0  # times its variance that are believed
 _STEPS = 6  # of Gauss and Newton at most, with the modulus held
@@ -77,6 +80,7 @@ def refine(
     start: Floats,
     render: Callable[[Mapping[str, float]], Single],
     *,
+    quick: Callable[[Mapping[str, float]], Single] | None = None,
     samples: int = 4000,
     seed: int = 0,
     begin: Near | None = None,
@@ -89,6 +93,8 @@ def refine(
     error : (k, k) covariance of the light map's errors in features.
     start : (5 + q,) where the fit begins.
     render : expected pictures (levels, 2, r, c) of a specimen's values, by light transport.
+    quick : the same of pictures without their references, (levels, 1, r, c), of which only the change between
+        specimens that are alike is right.
     begin : what is known of the light map's errors around the specimen, from other pictures of it: the
         fit begins there, for far from it that says nothing.
     always : (k, k) covariance of what rendered pictures are off by.
@@ -98,11 +104,16 @@ def refine(
     first = error + always if near is None else remains
     begins = start if near is None else near.at
     found = fit(chain, features, prior, observed, frames, begins, first, near)
+    if near is None and not _strange(found, features):
+        exact = _without_error(chain, features, prior, frames, found.x, remains)
+        if float((found.covariance.diagonal() / exact.diagonal())[:5].max()) < _AS_WELL**2:
+            followed, _ = valley(chain, features, prior, observed, frames, found, first)
+            still = _flat(found.x, np.zeros_like(found.pictures))
+            return Refined(followed.draw(prior, samples, seed), found, still, True, 0)
+    off = _off(chain, prior, found.x, render, quick)
     for renders in range(1, _RENDERS + 1):  # noqa: B007
         at = found.x
-        values = prior.values(at)
-        plain = found.pictures if near is None else found.pictures - near.of([at])[0]
-        near = _corrected(near, at, placed(render(values)[None], [values])[0] - plain, prior)
+        near = _corrected(near, at, off(at), prior)
         found = fit(chain, features, prior, observed, frames, at, remains, near)
         moved = float((np.abs(found.x - at) / np.sqrt(np.diag(found.covariance)))[:5].max())
         enough = _NEAR if len(near.slopes) else _FIRST
@@ -111,13 +122,49 @@ def refine(
     assert near is not None
     louder = found.chi_square / len(features.spread) if _strange(found, features) else 1.0
 
-    def off(x: Floats) -> Single:
-        values = prior.values(x)
-        seen = placed(render(values)[None], [values])[0]
-        return np.asarray(seen - expected(chain, prior, [x])[0], np.float32)
-
     followed, more = valley(chain, features, prior, observed, frames, found, remains, off, louder)
     return Refined(followed.draw(prior, samples, seed), found, near, bool(louder < _LOUDEST), renders + more)
+
+
+def _off(
+    chain: Chain,
+    prior: Prior,
+    at: Floats,
+    render: Callable[[Mapping[str, float]], Single],
+    quick: Callable[[Mapping[str, float]], Single] | None,
+) -> Callable[[Floats], Single]:
+    """By how much rendered pictures are above the chain's at unknowns (5 + q,).
+
+    Quickly, from what is rendered ``at`` a specimen, as long as the references stay as they are there: along
+    the valley only the inclusion changes, which they do not show.
+    """
+    values, plain = prior.values(at), expected(chain, prior, [at])[0]
+    aside = any(name in prior.names for name in ALIGNMENT)
+    first = placed(render(values)[None], [values])[0] - plain
+    begins: list[Single] = []
+
+    def off(x: Floats) -> Single:
+        if np.array_equal(x, at):
+            return np.asarray(first, np.float32)
+        new, seen = prior.values(x), expected(chain, prior, [x])[0]
+        if quick is None or aside or np.sqrt(np.mean((seen - plain)[:, 1] ** 2)) > _ALIKE:
+            return np.asarray(placed(render(new)[None], [new])[0] - seen, np.float32)
+        if not begins:
+            begins.append((first + plain)[:, :1] - quick(values))
+        pressed = begins[0] + quick(new) - seen[:, :1]
+        return np.concatenate([pressed, first[:, 1:]], axis=1)
+
+    return off
+
+
+def _without_error(
+    chain: Chain, features: Features, prior: Prior, frames: float, x: Floats, error: Floats
+) -> Floats:
+    """The covariance (5 + q, 5 + q) around x if features were off by ``error`` (k, k) and noise alone."""
+    seen, slopes = jacobian(chain, features, prior, x)
+    gain = chain.gain(prior.values(x))
+    noise = covariance(chain, features, seen, gain, frames, prior.pattern) + error
+    return np.asarray(np.linalg.inv(slopes @ np.linalg.solve(noise, slopes.T) + prior.precision))
 
 
 def _corrected(near: Near | None, at: Floats, off: Single, prior: Prior) -> Near:
@@ -195,14 +242,15 @@ def valley(
     frames: float,
     fitted: Fitted,
     error: Floats,
-    off: Callable[[Floats], Single],
+    off: Callable[[Floats], Single] | None = None,
     louder: float = 1.0,
 ) -> tuple[Valley, int]:
     """Follow the posterior from modulus to modulus, away from the most probable specimen.
 
     Parameters
     ----------
-    off : by how much pictures are above the chain's at unknowns (5 + q,), by rendering.
+    off : by how much pictures are above the chain's at unknowns (5 + q,), by rendering; None where they are
+        taken as the chain has them.
     louder : multiplies the noise's variance.
 
     Returns
@@ -217,6 +265,10 @@ def valley(
 
     def node(x: Floats, near: Near | None) -> _Node:
         nonlocal looks
+        if off is None:
+            x = inside(prior, x)
+            still = _flat(x, np.zeros_like(fitted.pictures))
+            return _held(chain, features, prior, observed, noise, x, rest, still)
         if near is not None:  # as far as the map is off at its neighbour
             x = _held(chain, features, prior, observed, noise, x, rest, near).x
         for _ in range(_LOOKS):
