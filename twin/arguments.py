@@ -124,10 +124,14 @@ def _parser() -> Parser:
     _add_inclusion_flags(simulate)
     _add_pose_flags(simulate, "emulator")
     simulate.add_argument(
-        "--emulator", metavar="FILE.npz", help="for --mechanics emulator (default emulators/DESIGN.npz)"
+        "--emulator",
+        metavar="FILE.npz",
+        help="for --mechanics emulator (default emulators/DESIGN.npz, else the one that ships)",
     )
     simulate.add_argument(
-        "--traced", metavar="FILE.npz", help="traced light without noise, of `twin emulate DESIGN --light`"
+        "--traced",
+        metavar="FILE.npz",
+        help="traced light without noise, of `twin emulate DESIGN --light`; tsis ships",
     )
     press = simulate.add_mutually_exclusive_group()
     _add_depths(press)
@@ -177,7 +181,9 @@ def _parser() -> Parser:
         "--light", action="store_true", help="learn the traced light of presses instead (15 core minutes)"
     )
     emulate.add_argument(
-        "--emulator", metavar="FILE.npz", help="with --light: of the mechanics (default emulators/DESIGN.npz)"
+        "--emulator",
+        metavar="FILE.npz",
+        help="with --light: of the mechanics (default emulators/DESIGN.npz, else the one that ships)",
     )
     emulate.add_argument("--workers", type=whole, metavar="N", help="processes (default: all cores)")
     emulate.add_argument("--seed", type=whole, default=0, metavar="N", help="of the samples (default 0)")

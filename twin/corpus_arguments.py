@@ -20,7 +20,7 @@ file. Then a sample or two are really simulated, to say how long the run will ta
 
 examples:
   twin corpus plan paper --out corpora/paper
-  twin corpus plan training --emulator emulators/tsis.npz --frames 1000000 --out corpora/training
+  twin corpus plan training --frames 1000000 --out corpora/training
   twin corpus plan my-study.toml --count 3 --quality preview --no-probe --out corpora/trial
 """
 
@@ -101,9 +101,15 @@ def _add_plan(actions: Any) -> None:
         metavar="M",
         help=", ".join((*MECHANICS, "emulator")) + " (default: the study's)",
     )
-    plan.add_argument("--emulator", metavar="FILE.npz", help="for emulator (default emulators/DESIGN.npz)")
     plan.add_argument(
-        "--traced", metavar="FILE.npz", help="traced light without noise, of `twin emulate DESIGN --light`"
+        "--emulator",
+        metavar="FILE.npz",
+        help="for emulator (default emulators/DESIGN.npz, else the one that ships)",
+    )
+    plan.add_argument(
+        "--traced",
+        metavar="FILE.npz",
+        help="traced light without noise, of `twin emulate DESIGN --light`; tsis ships",
     )
     for flag, of in (("--quality", "the mechanics"), ("--light", "the light")):
         words = f"{', '.join(QUALITIES)}: of {of} (default: the study's)"

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 import fem
 from scenes.sensor import NotModelled
 from twin import evaluate as judging
-from twin import explored, layout_fields, presses, proposals
+from twin import explored, layout_fields, learned, presses, proposals
 from twin.alive import alive, locked
 from twin.complaint import DesignError, shown
 from twin.design import Design, load_design, shipped_designs
@@ -183,8 +183,10 @@ def _emulator(
             moves = next(n for n, k in zip(axes, kinds, strict=True) if k == "mechanical")
             raise DesignError("emulator", f"it with {moves}, which changes the mechanics", "none")
         return None
-    named = given or (source.folder / study.emulator if study.emulator else None)
-    file = Path(named) if named else presses.EMULATORS / f"{design.name}.npz"
+    named = given or study.emulator
+    file = learned.usual_emulator(design.name)
+    if named:
+        file = learned.emulator_file(named, Path() if given else source.folder)
     if named is None and not file.exists():
         return None
     made = layout_fields.base(study, design)

@@ -23,7 +23,7 @@ cut off; more processes may work on the same DIR, and on other machines with --s
 
 examples:
   twin explore leds --out leds --plan
-  twin explore protocol --out protocol --emulator emulators/tsis.npz
+  twin explore protocol --out protocol --emulator tsis
   twin explore my-study.toml --out found --trials 200 --workers 8
   twin explore my-study.toml --out found --storage postgresql://user@host/studies
   twin explore surface --out surface --confirm 20
@@ -39,7 +39,9 @@ def add(verbs: Any) -> None:
     verb.add_argument("--workers", type=whole, metavar="N", help="processes (default: all cores)")
     verb.add_argument("--storage", metavar="URL", help="database of the study (default DIR/study.db)")
     verb.add_argument(
-        "--emulator", metavar="FILE.npz", help="of the design's mechanics (default emulators/DESIGN.npz)"
+        "--emulator",
+        metavar="FILE.npz",
+        help="of the design's mechanics (default emulators/DESIGN.npz, else the one that ships)",
     )
     verb.add_argument("--plan", action="store_true", help="say what each field changes and how long it takes")
     verb.add_argument(

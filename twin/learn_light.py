@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.stats import qmc
 
 import fem
-from twin import presses
+from twin import learned, presses
 from twin.complaint import DesignError, shown
 from twin.conflicts import black, colourless
 from twin.design import Design, parse_design
@@ -65,7 +65,7 @@ def learn_light(
     Parameters
     ----------
     out : name of the file, ending in ``.npz``.
-    emulator : of the design's mechanics; by default the file of its name in `presses.EMULATORS`.
+    emulator : of the design's mechanics; by default the usual one, `twin.learned.usual_emulator`.
     samples : presses, 64 or more.
 
     Raises
@@ -80,7 +80,7 @@ def learn_light(
     black(design, "learned light")
     if samples < 64:
         raise DesignError("samples", shown(samples), "64 or more")
-    file = Path(emulator) if emulator is not None else presses.EMULATORS / f"{design.name}.npz"
+    file = learned.usual_emulator(design.name) if emulator is None else learned.emulator_file(emulator)
     known = presses.emulator_of(design, file)
     folder = target.with_name(target.name + ".presses")
     folder.mkdir(parents=True, exist_ok=True)
@@ -98,13 +98,13 @@ def learn_light(
     tell("fit", 1.0)
     sensors = spectral.band_sensors(design.sensor(), count=design.light.bands, at=design.sensor)
     found = [_read(path) for task in tasks for path in _files(task)]
-    learned = tuple(
+    light = tuple(
         traced.learn(sensor, [one[0] for one in found], [one[1][number] for one in found])
         for number, (_, _, sensor) in enumerate(sensors)
     )
     with staged_file(out, "out", ".npz") as place:
-        traced.save(learned, place)
-    return learned
+        traced.save(light, place)
+    return light
 
 
 def light_of(file: str | Path) -> tuple[TracedLight, ...]:
@@ -112,9 +112,10 @@ def light_of(file: str | Path) -> tuple[TracedLight, ...]:
     from scenes import traced
 
     try:
-        return traced.load(file)
+        return traced.load(learned.light_file(file))
     except (OSError, traced.NotModelled):
-        raise DesignError("traced", shown(str(file)), "a file of `twin emulate --light`") from None
+        allowed = " or ".join(["a file of `twin emulate --light`", *learned.shipped()])
+        raise DesignError("traced", shown(str(file)), allowed) from None
 
 
 def tasks_of(

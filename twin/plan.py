@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import fem
-from twin import presses
+from twin import learned, presses
 from twin.complaint import DesignError, shown
 from twin.conflicts import black, colourless
 from twin.design import Design, load_design, parse_design, shipped_designs
@@ -83,9 +83,9 @@ def freeze(
         raise error.renamed(source=source.name) from None
     mechanics = mechanics or settings.mechanics or design.mechanics
     file = _emulator_file(source, design, mechanics, emulator)
-    light_file = Path(traced) if traced is not None else None
+    light_file = learned.light_file(traced) if traced is not None else None
     if light_file is None and settings.traced is not None:
-        light_file = source.folder / settings.traced
+        light_file = learned.light_file(settings.traced, source.folder)
     try:
         if light_file is not None:
             black(design, "learned light")
@@ -169,10 +169,10 @@ def _emulator_file(
             raise DesignError("emulator", "it with other mechanics", "it with mechanics emulator only")
         return None
     if given is not None:
-        return Path(given)
+        return learned.emulator_file(given)
     if source.study.emulator is not None:
-        return source.folder / source.study.emulator
-    return presses.EMULATORS / f"{design.name}.npz"
+        return learned.emulator_file(source.study.emulator, source.folder)
+    return learned.usual_emulator(design.name)
 
 
 def _setting(source: Source, design: Design, seed: int, file: Path | None, traced: Path | None) -> Setting:

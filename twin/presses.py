@@ -13,6 +13,7 @@ import numpy as np
 import fem
 from fem import emulator_limits
 from fem.model import check as check_mechanics
+from twin import learned
 from twin.complaint import DesignError, shown
 from twin.design import Design
 
@@ -21,9 +22,6 @@ if TYPE_CHECKING:
 
 Mechanics = Literal["finite", "linear"]
 Quality = Literal["preview", "standard", "reference"]
-
-EMULATORS = Path("emulators")
-"""Folder where a design's emulator is looked for: `tsis.npz` for the design `tsis`."""
 
 # What an emulator calls otherwise than a design.
 _NAMES = {
@@ -146,7 +144,7 @@ def solved(
 
 
 def emulator_of(design: Design, emulator: Emulator | str | Path | None) -> Emulator:
-    """Return the emulator itself or of a file, by default that of the design's name in `EMULATORS`.
+    """Return the emulator itself or of a name or file, by default the usual one of the design's name.
 
     Raises
     ------
@@ -154,13 +152,14 @@ def emulator_of(design: Design, emulator: Emulator | str | Path | None) -> Emula
         In one line, where there is none, how to build one.
     """
     if emulator is None:
-        emulator = EMULATORS / f"{design.name}.npz"
+        emulator = learned.usual_emulator(design.name)
     if not isinstance(emulator, str | Path):
         return emulator
     try:
-        return fem.load_emulator(emulator)
+        return fem.load_emulator(learned.emulator_file(emulator))
     except OSError:
-        allowed = f"a file that `twin emulate DESIGN --out {EMULATORS / 'NAME.npz'}` wrote"
+        allowed = f"a file that `twin emulate DESIGN --out {learned.FOLDER / 'NAME.npz'}` wrote"
+        allowed += f", or {', '.join(learned.shipped())}, which ships" if learned.shipped() else ""
         raise DesignError("emulator", shown(str(emulator)), allowed) from None
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from twin import presses
+from twin import learned
 from twin.complaint import DesignError, shown
 from twin.planned import PLAN, load_plan
 from twin.stage import staged
@@ -29,6 +29,7 @@ def replicate(
     quick: bool = False,
     seed: int = 0,
     emulator: str | Path | None = None,
+    solve: bool = False,
     workers: int | None = None,
     repeats: int | None = None,
     progress: Callable[[str, float], None] | None = None,
@@ -40,7 +41,9 @@ def replicate(
     corpus : a finished corpus; without one the study ``paper`` (or ``paper-quick``) is planned and run in
         OUT/corpus, or gone on with if it is there.
     seed : of the corpus, where it is planned here, and of the networks.
-    emulator : file to simulate the corpus by; default emulators/tsis.npz if it is there, but with `quick`.
+    emulator : file to simulate the corpus by, or the name of a shipped one; default that of `tsis`, but with
+        `quick`, which solves at small strain.
+    solve : simulate by full solves, not by an emulator.
     repeats : networks per estimate, default 100, or 10 with `quick`.
 
     Raises
@@ -57,7 +60,7 @@ def replicate(
     _check(out, target)
     place = Path(corpus) if corpus is not None else target / CORPUS
     if corpus is None:
-        simulate(place, _QUICK if quick else _FULL, seed, emulator, quick, workers, tell)
+        simulate(place, _QUICK if quick else _FULL, seed, emulator, quick or solve, workers, tell)
     opened = Corpus(place)
     found = compute(opened, repeats=repeats or (_QUICK_REPEATS if quick else 100), seed=seed, progress=tell)
     with _into(out, target) as folder:
@@ -71,7 +74,7 @@ def simulate(
     study: str,
     seed: int,
     emulator: str | Path | None,
-    quick: bool,
+    solve: bool,
     workers: int | None,
     tell: Callable[[str, float], None],
 ) -> None:
@@ -79,8 +82,10 @@ def simulate(
     from twin.plan import freeze
     from twin.run import run
 
-    usual = presses.EMULATORS / "tsis.npz"
-    file = Path(emulator) if emulator is not None else usual if usual.is_file() and not quick else None
+    usual = learned.usual_emulator("tsis")
+    file = learned.emulator_file(emulator) if emulator is not None else None
+    if file is None and usual.is_file() and not solve:
+        file = usual
     if (folder / PLAN).is_file():
         plan = load_plan(folder)
         if (plan.name, plan.head.seed) != (study, seed):

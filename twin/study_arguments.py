@@ -21,12 +21,13 @@ examples:
 _REPLICATE = """\
 The source paper from one command: its Tables I to III, Figs. 3(c), 4 and 5, both protocols, constant
 predictors and earlier methods, beside what it printed. Without --corpus the paper's set is simulated first,
-into OUT/corpus (again continues where it was cut off): about half an hour on two cores with an emulator,
-longer without; --quick is a smaller one at preview quality. Writes report.html, estimates.csv, errors.csv and
-replicate.json into OUT.
+into OUT/corpus (again continues where it was cut off): about half an hour on two cores, by the emulator that
+ships; about an hour with --solve, by finite elements; --quick is a smaller one at preview quality. Writes
+report.html, estimates.csv, errors.csv and replicate.json into OUT.
 
 examples:
   twin replicate --out replica
+  twin replicate --solve --out replica
   twin replicate --quick --out replica
   twin replicate --corpus corpora/paper --out replica
 """
@@ -55,7 +56,10 @@ def add(verbs: Any) -> None:
     replicate.add_argument(
         "--seed", type=whole, default=0, metavar="N", help="of all random numbers (default 0)"
     )
-    replicate.add_argument("--emulator", metavar="FILE.npz", help="simulate the corpus by this emulator")
+    replicate.add_argument(
+        "--emulator", metavar="FILE.npz", help="simulate the corpus by this emulator (default tsis)"
+    )
+    replicate.add_argument("--solve", action="store_true", help="simulate the corpus by finite elements")
     replicate.add_argument(
         "--workers", type=whole, metavar="N", help="processes to simulate with (default: all cores)"
     )

@@ -38,9 +38,11 @@ def _map(arguments: argparse.Namespace) -> int:
 def _replicate(arguments: argparse.Namespace) -> int:
     if arguments.out is None:
         raise DesignError("--out", "nothing", "the folder to make for the report")
-    for flag in ("quick", "emulator", "workers"):
+    for flag in ("quick", "emulator", "solve", "workers"):
         if arguments.corpus is not None and getattr(arguments, flag):
             raise DesignError(f"--{flag}", "it with --corpus", "one of them: that corpus is finished")
+    if arguments.solve and arguments.emulator is not None:
+        raise DesignError("--solve", "it with --emulator", "one of them")
     if arguments.workers == 0:
         raise DesignError("--workers", "0", "an integer > 0")
     from twin import replicate
@@ -55,6 +57,7 @@ def _replicate(arguments: argparse.Namespace) -> int:
                 quick=arguments.quick,
                 seed=arguments.seed,
                 emulator=arguments.emulator,
+                solve=arguments.solve,
                 workers=arguments.workers,
                 progress=report,
             )

@@ -1,8 +1,7 @@
 """Full solves with standard light beside the emulator with learned light: the same specimens, drawn twice.
 
 twin corpus plan phantoms --seed 5 --out corpora/phantoms
-twin corpus plan phantoms --seed 5 --mechanics emulator --emulator emulators/tsis.npz \\
-    --traced emulators/tsis.light.npz --light preview --out corpora/emulated
+twin corpus plan phantoms --seed 5 --mechanics emulator --traced tsis --light preview --out corpora/emulated
 twin corpus run corpora/phantoms; twin corpus run corpora/emulated
 TWIN_SOLVED=corpora/phantoms TWIN_EMULATED=corpora/emulated \\
     pytest -m slow -s tests/bench/test_same_pictures.py
@@ -18,7 +17,9 @@ import twin
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif("TWIN_SOLVED" not in os.environ, reason="needs TWIN_SOLVED and TWIN_EMULATED"),
+    pytest.mark.skipif(
+        not {"TWIN_SOLVED", "TWIN_EMULATED"} <= set(os.environ), reason="needs TWIN_SOLVED and TWIN_EMULATED"
+    ),
 ]
 BLOCK = 12  # pixels
 COUNTS, PERCENT = 0.5, 0.5  # rms that the tared pictures, in blocks, and the pressures may be apart

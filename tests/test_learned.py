@@ -1,0 +1,83 @@
+"""What ships learned: of its design and of this version's light, and as right as solves and tracings."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fem
+import twin
+from scenes import SpectralRenderer, spectral, traced
+from twin import learned, presses
+from twin.cli import main
+from twin.learn_light import light_of
+from twin.retake import average
+
+BALL = fem.Inclusion(10.0, 5.0, 100.0)
+
+
+@pytest.mark.parametrize("name", learned.shipped())
+def test_what_ships_is_of_the_design_of_its_name_and_of_this_versions_light(name):
+    design = twin.load_design(name)
+    emulator = presses.emulator_of(design, name)
+    presses.check_emulated(design, BALL, [1.0, 2.0, 2.9], emulator)
+    sensors = spectral.band_sensors(design.sensor(), count=design.light.bands, at=design.sensor)
+    traced.check(light_of(name), [sensor for _, _, sensor in sensors])
+
+
+def test_a_name_is_a_shipped_file_and_a_path_stays_a_path(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert "tsis" in learned.shipped()
+    assert learned.emulator_file("tsis").is_file() and learned.light_file("tsis").is_file()
+    for find in (learned.emulator_file, learned.light_file):
+        assert find("./tsis") == Path("tsis") and find("mine/tsis.npz") == Path("mine/tsis.npz")
+    assert learned.usual_emulator("tsis") == learned.emulator_file("tsis")
+    assert learned.usual_emulator("mine") == Path("emulators/mine.npz")
+    Path("emulators").mkdir()
+    Path("emulators/tsis.npz").touch()
+    assert learned.usual_emulator("tsis") == Path("emulators/tsis.npz")
+
+
+def test_the_sensor_is_simulated_from_what_ships(tmp_path):
+    press = ["--size", "10", "--depth", "5", "--modulus", "100", "--indentation", "2"]
+    how = ["--quality", "preview", "--mechanics", "emulator", "--traced", "tsis"]
+    assert main(["simulate", *press, *how, "--out", str(tmp_path / "out")]) == 0
+    frame = json.loads((tmp_path / "out" / "frame.json").read_text(encoding="utf-8"))
+    assert frame["tsis"]["noise_percent"] == 0.0 and frame["tsis"]["tared"]["max_dn"] > 20.0
+
+
+@pytest.mark.slow
+def test_the_shipped_emulator_against_full_solves():
+    """Finite strain at standard quality, which it was learned from, an inclusion that it did not see."""
+    design = twin.load_design("tsis")
+    ball = fem.Inclusion(9.3, 5.6, 83.0, (1.1, -0.7))
+    levels = [1.0, 2.0, 2.9]
+    guessed = presses.emulated(design, ball, levels, presses.emulator_of(design, None))
+    solved = presses.solved(design, ball, levels, quality="standard", pictured=True)
+    for level, guess, press in zip(levels, guessed, solved, strict=True):
+        assert np.allclose(guess.surface.points, press.surface.points)
+        off = guess.surface["pressure"] - press.surface["pressure"]
+        percent = 100 * np.sqrt((off**2).mean()) / press.surface["pressure"].mean()
+        print(f"{level} mm: {percent:.2f} % rms of the mean pressure")
+        assert percent < 0.6
+
+
+@pytest.mark.slow
+def test_the_shipped_light_against_tracing():
+    """Standard light, with and without, in blocks of 12 x 12 pixels; two tracings tell their own noise."""
+    design = twin.load_design("tsis")
+    (press,) = presses.emulated(design, BALL, [2.0], presses.emulator_of(design, None))
+    renderer = SpectralRenderer(design.sensor(), count=design.light.bands, at=design.sensor, device="cpu")
+    both = [renderer.render(press.surface, quality="standard", seed=seed) for seed in (1, 2)]
+    guess = renderer.render(press.surface, quality="standard", seed=1, traced=light_of("tsis"))
+    first, second, learnt = (
+        average(one.radiance.sum(axis=0).astype(np.float32), (12, 12)) for one in (*both, guess)
+    )
+    noise = np.mean((first - second) ** 2) / 4.0  # of their mean
+    off = learnt - 0.5 * (first + second)
+    apart = np.sqrt(max(float((off**2).mean() - noise), 0.0)) / float(learnt.mean())
+    print(
+        f"in common {100 * apart:.2f} %, noise of two tracings {100 * np.sqrt(noise) / learnt.mean():.2f} %"
+    )
+    assert apart < 0.01
