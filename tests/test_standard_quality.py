@@ -2,7 +2,7 @@
 
 Pictures of 96 x 61 pixels, each 8 x 8 of the paper's camera: all that is compared are means over more.
 Sensors and presses are alike in their four quarters, so pictures are folded, which halves their noise.
-Standard pictures are noisy, too: 0.6 % in a millimetre at the rim.
+Standard pictures are noisy, too: 0.6 % in a millimetre at the rim. A case takes 20 minutes of a core.
 What `assets/light_bias.json` tells frames is measured here: `--write-bias` writes it, else it is compared.
 """
 
@@ -30,10 +30,10 @@ CASES = {
     "domed, full contact": lambda: _with_skin("air", contact="full"),
     "air, water film": lambda: _with_skin("air", gap_index=1.33),
 }
-PASSES, PATHS = 12, 2**20
+PASSES, PATHS = 48, 2**20
 """Reference pictures and their light paths per LED."""
 
-SEEDS = 8
+SEEDS = 48
 """Pictures of the gathered qualities."""
 
 BLOB, BACKGROUND = (26, 31, 44, 48), (26, 31, 17, 25)
@@ -52,13 +52,13 @@ def pictures(
     name: str, passes: int = PASSES, paths: int = PATHS, seeds: int = SEEDS
 ) -> tuple[np.ndarray, np.ndarray]:
     """Standard and reference pictures (seeds or passes, 31, 48)."""
-    return gathered(name, "standard", seeds), _pictures(name, "reference", range(100, 100 + passes), paths)
+    return gathered(name, "standard", seeds), _pictures(name, "reference", range(2001, 2001 + passes), paths)
 
 
 @cache
 def gathered(name: str, quality: str, count: int) -> np.ndarray:
     """Pictures (count, 31, 48) of so many seeds."""
-    return _pictures(name, quality, range(1, 1 + count))
+    return _pictures(name, quality, range(1001, 1001 + count))
 
 
 def _pictures(name: str, quality: str, seeds: range, paths: int | None = None) -> np.ndarray:
