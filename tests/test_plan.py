@@ -251,6 +251,7 @@ def test_the_probe_and_what_follows_from_it(tmp_path, monkeypatch):
 def test_the_command(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     fake(monkeypatch, [])
+    monkeypatch.setattr("twin.learned.shipped", list)
     assert cli.main(["corpus", "plan", "quick", "--out", "c", "--frames", "1000", "--seed", "3"]) == 0
     out = capsys.readouterr().out
     assert "4 samples (1 blank) at 2 mm, 4 frames; seed 3" in out and "1000 in 1000 samples" in out
