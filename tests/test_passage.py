@@ -40,9 +40,9 @@ def test_a_spot_of_slanting_light_comes_out_as_its_transform_says(
     sheet: tuple[float, ...], cosine: float, azimuth: float, sigma: float
 ) -> None:
     """Gaussian spots, mm, against the transform of the beam itself. What is left out are high harmonics of
-    small things in grazing light: 5 % of the largest value there at 0.7 mm, 1.2 % at 1.5 mm; else 3 and
-    0.5 %."""
-    allowed = {0.7: (0.05, 0.03), 1.5: (0.012, 0.005)}[sigma][cosine > 0.4]
+    small things in grazing light: 2 % of the largest value there at 0.7 mm, 0.5 % at 1.5 mm; else 1.5 and
+    0.4 %."""
+    allowed = {0.7: (0.02, 0.015), 1.5: (0.005, 0.004)}[sigma][cosine > 0.4]
     width, cells = 24.0, 48
     body, coupling, first = setting(width, cells, *sheet)
     middles = (np.arange(cells) + 0.5) / cells * width - width / 2
@@ -62,12 +62,15 @@ def test_a_spot_of_slanting_light_comes_out_as_its_transform_says(
     wide = np.zeros((padded, padded))
     wide[inner, inner] = np.exp(-0.5 * (middles**2 + middles[:, None] ** 2) / sigma**2)
     exact = [np.fft.ifft2(one * np.fft.fft2(wide)).real[shown, shown] for one in transform]
-    assert np.abs(first._back(glimpse.spectra[0]) - exact[1]).max() < allowed * exact[1].max()
+    steep = np.abs(first._back(glimpse.spectra[0]) - exact[1]).max() / exact[1].max()
+    assert steep < allowed
     # what comes out of the Lambertian light in its place
     lambertian = body.slab.reflectance(waves.ravel() / body.transport_per_mm).reshape(waves.shape)
     wide[shown, shown] = dataclasses.replace(first, entering=first.leaving).enter(maps)[0][0]
     found = np.fft.ifft2(lambertian * np.fft.fft2(wide)).real[shown, shown]
-    assert np.abs(found - exact[0])[inner, inner].max() < allowed * exact[0].max()
+    whole = np.abs(found - exact[0])[inner, inner].max() / exact[0].max()
+    print(f"spot of {sigma} mm, cosine {cosine}: {steep:.2%} of the brightest seen, {whole:.2%} of all")
+    assert whole < allowed
 
 
 @pytest.mark.parametrize("node", [0, 64, 128])
