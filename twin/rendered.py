@@ -43,7 +43,7 @@ def rendered(
 ) -> Single:
     """Return expected counts above black, (levels, 2, r, c), of one specimen; values as of `chain.contacts`.
 
-    With ``quick``, in a third of the time, pictures alone without references, (levels, 1, r, c), of binned
+    With ``quick``, in less than half of the time, pictures without references, (levels, 1, r, c), of binned
     pixels: what they change by from one specimen to another like it is right.
 
     Raises `fem.NotModelled` outside of the emulator or of the learned light.
