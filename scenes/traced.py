@@ -66,8 +66,8 @@ class TracedLight:
     presses: int
     error_percent: float
 
-    def at(self, sensor: Sensor, shape: OpticalSurface, fraction: Array) -> Array:
-        """Return the traced light of a press, (n_led, layers, g, g) W/mm².
+    def at(self, sensor: Sensor, shape: OpticalSurface, fraction: Array) -> Single:
+        """Return the traced light of a press, (n_led, layers, g, g) W/mm², in single precision.
 
         Parameters
         ----------
@@ -89,11 +89,11 @@ class TracedLight:
             raise NotModelled(
                 f"traced: received a press {far:.2g} times as far out as those learned; allowed {_BEYOND:g}"
             )
-        amounts = _terms(inputs[None])[0] @ self.weights
+        amounts = (_terms(inputs[None])[0] @ self.weights).astype(np.float32)
         found = _enlarged(self.mean, fraction.shape[0])
         found += _enlarged(np.tensordot(amounts, self.modes, 1), fraction.shape[0])
-        flux = np.array([led.flux_W for led in sensor.leds])
-        return np.asarray(flux[:, None, None, None] * found)
+        found *= np.array([led.flux_W for led in sensor.leds], np.float32)[:, None, None, None]
+        return found
 
 
 def optics_key(sensor: Sensor) -> str:
@@ -265,9 +265,10 @@ def blocks(cells: Array, to: int) -> Array:
     return np.asarray(cells.reshape(*cells.shape[:-2], to, step, to, step).mean(axis=(-3, -1)))
 
 
-def _enlarged(maps: NDArray[np.floating], to: int) -> Array:
+def _enlarged(maps: Single, to: int) -> Single:
     """Maps on `to` cells per side, linear in between."""
     cells = maps.shape[-1]
     middles, finer = (np.arange(cells) + 0.5) / cells, (np.arange(to) + 0.5) / to
     step = np.stack([np.interp(finer, middles, column) for column in np.eye(cells)], axis=1)
-    return np.asarray(np.matmul(np.matmul(step, maps), step.T), np.float64)
+    step = step.astype(np.float32)
+    return np.asarray(np.matmul(np.matmul(step, maps), step.T))

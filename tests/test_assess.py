@@ -76,6 +76,24 @@ def test_the_record_tells_all_that_the_words_say(tmp_path: Any) -> None:
     assert (tmp_path / "a.png").stat().st_size > 20_000
 
 
+def test_means_of_some_of_the_samples_are_told_of_these(tmp_path: Any) -> None:
+    """`--averaged`: the rest count for one exposure only."""
+    some = rows()
+    for row in some[16:]:
+        del row["100"]
+    record = record_of(some, RANGES, True) | {"corpus_name": "made up"}
+    assert [record[frames]["inclusions"] for frames in ("1", "100")] == [35, 14]
+    assert record["1"] == record_of(rows(), RANGES, True)["1"]
+    assert record["100"] == record_of(some[:16], RANGES, True)["100"]
+    for row in some:
+        row.pop("100", None)
+    alone = record_of(some, RANGES, True) | {"corpus_name": "made up"}
+    assert "100" not in alone and "100 exposures" not in words(alone)
+    (tmp_path / "assessment.json").write_text(json.dumps(alone))
+    draw({1: answered(some, 1, "rendered")}, RANGES, 5.0, tmp_path / "assessment.png")
+    assert "mean of 100" not in assessing_report.write(tmp_path).read_text(encoding="utf-8")
+
+
 def test_the_page_holds_the_tables_and_a_learning_curve(tmp_path: Any) -> None:
     """All in one file, of whatever lies in the folder; a browser has nothing to complain of."""
     curve = {"corpus": "made up", "model": "m", "tested": 60, "parameters": [], "bound": [0.05, 0.03, 12.0]}

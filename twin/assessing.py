@@ -54,6 +54,7 @@ class Task(Sample):
 
     rendered: bool
     seed: int
+    exposures: tuple[int, ...] = FRAMES
 
 
 def assess(
@@ -62,6 +63,7 @@ def assess(
     out: str | Path,
     *,
     samples: int | None = None,
+    averaged: int | None = None,
     rendered: bool = True,
     workers: int | None = None,
     seed: int = 0,
@@ -72,6 +74,7 @@ def assess(
     Parameters
     ----------
     samples : how many at most; of the group "test" where there is one.
+    averaged : of how many of these, the first, means of many exposures are answered, too; all by default.
     rendered : whether answers are refined by rendering, too: a minute or two a sample.
 
     Raises
@@ -92,8 +95,16 @@ def assess(
     }
     _claim(folder, told)
     tasks = [
-        Task(str(model), str(corpus), number, folder / SAMPLES / f"{number:06d}.json", rendered, seed)
-        for number in numbers
+        Task(
+            str(model),
+            str(corpus),
+            number,
+            folder / SAMPLES / f"{number:06d}.json",
+            rendered,
+            seed,
+            FRAMES if averaged is None or place < averaged else FRAMES[:1],
+        )
+        for place, number in enumerate(numbers)
     ]
     left = [task for task in tasks if not _done(task)]
 
@@ -108,7 +119,7 @@ def assess(
 
     write_json(folder / RECORD, record)
     tissue_kPa = estimator.chain.design.specimen.modulus_kPa
-    drawn = {frames: answered(rows, frames, METHODS[rendered]) for frames in FRAMES}
+    drawn = {frames: answered(rows, frames, METHODS[rendered]) for frames in FRAMES if str(frames) in record}
     draw(drawn, estimator.prior.ranges, tissue_kPa, folder / PICTURE)
     assessing_report.write(folder)
     return record
@@ -155,7 +166,7 @@ def _done(task: Task) -> bool:
     if not task.place.is_file():
         return False
     row = json.loads(task.place.read_bytes())
-    return row["rendered"] or not task.rendered
+    return (row["rendered"] or not task.rendered) and all(str(frames) in row for frames in task.exposures)
 
 
 @lru_cache(maxsize=1)
@@ -188,7 +199,7 @@ def answer(task: Task) -> None:
             parts = ablation.bounds(estimator.chain, estimator.prior, values)
             row["parts"] = {name: sd.tolist() for name, sd in parts.items()}
     near, start = None, None
-    for frames in FRAMES:
+    for frames in task.exposures:
         if frames == 1:
             seen = stored(estimator, source, task.number, levels)
         else:

@@ -50,6 +50,10 @@ def _lead(record: Mapping[str, Any] | None, curve: Mapping[str, Any] | None) -> 
     return f"{record['inclusions']} inclusions and {record['blanks']} blanks of {record['corpus_name']}"
 
 
+def _there(record: Mapping[str, Any]) -> list[int]:
+    return [frames for frames in FRAMES if str(frames) in record]
+
+
 def _told(record: Mapping[str, Any], frames: int) -> tuple[str, dict[str, Any]]:
     """The best method that was tried, and its figures."""
     part = record[str(frames)]
@@ -59,7 +63,7 @@ def _told(record: Mapping[str, Any], frames: int) -> tuple[str, dict[str, Any]]:
 
 def _verdict(record: Mapping[str, Any]) -> list[str]:
     lines = []
-    for frames in FRAMES:
+    for frames in _there(record):
         method, one = _told(record, frames)
         part = one.get(_SIZES[0])
         if not part:
@@ -78,7 +82,7 @@ def _verdict(record: Mapping[str, Any]) -> list[str]:
 def _estimates(page: Page, record: Mapping[str, Any]) -> None:
     rows, strong = [], []
     sure = []
-    for frames in FRAMES:
+    for frames in _there(record):
         for method in METHODS:
             one = record[str(frames)].get(method)
             if not one:
@@ -116,7 +120,7 @@ def _estimates(page: Page, record: Mapping[str, Any]) -> None:
 
 def _presence(page: Page, record: Mapping[str, Any]) -> None:
     rows = []
-    for frames in FRAMES:
+    for frames in _there(record):
         for cell in record[str(frames)]["presence"].get("beside_ideal") or ():
             size, depth = (_span(*cell[name]) for name in ("size_mm", "depth_mm"))
             figures = [f"{cell['area']:.3f}", f"{cell['ideal']:.3f}"]

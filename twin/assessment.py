@@ -39,8 +39,8 @@ class Answered:
 
 
 def answered(rows: list[dict[str, Any]], frames: int, method: str) -> Answered:
-    """Return all inclusions' answers from their records."""
-    there = [row for row in rows if not row["blank"]]
+    """Return the answers to all inclusions that such means were answered of, from their records."""
+    there = [row for row in rows if not row["blank"] and str(frames) in row]
     parts = [row[str(frames)] for row in there]
     short = {name: np.array([part[method][name] for part in parts]).reshape(-1, 3) for name in SHORT}
     limits = [part["bound"] or [np.nan] * len(NAMES) for part in parts]
@@ -54,10 +54,15 @@ def answered(rows: list[dict[str, Any]], frames: int, method: str) -> Answered:
 
 def record_of(rows: list[dict[str, Any]], ranges: NDArray[np.float64], rendered: bool) -> dict[str, Any]:
     """Return the figures of all samples' records; ``ranges`` (5, 2) of the parameters."""
-    blank = np.array([row["blank"] for row in rows])
-    found: dict[str, Any] = {"inclusions": int((~blank).sum()), "blanks": int(blank.sum())}
+    blanks = sum(row["blank"] for row in rows)
+    found: dict[str, Any] = {"inclusions": len(rows) - blanks, "blanks": blanks}
+    every = rows
     for frames in FRAMES:
-        part: dict[str, Any] = {}
+        rows = [row for row in every if str(frames) in row]
+        if not rows:
+            continue
+        blank = np.array([row["blank"] for row in rows])
+        part: dict[str, Any] = {"inclusions": int((~blank).sum()), "blanks": int(blank.sum())}
         for method in METHODS[: 1 + rendered]:
             one = answered(rows, frames, method)
             part[method] = figures(one.answers, one.truth, one.limits, ranges)
@@ -72,7 +77,7 @@ def record_of(rows: list[dict[str, Any]], ranges: NDArray[np.float64], rendered:
             part["explained_by_rendering"] = float(np.mean([one.get("explains", False) for one in tried]))
             part["renders"] = float(np.mean([one.get("renders", 0) for one in tried]))
         found[str(frames)] = part
-    seen = [row["parts"] for row in rows if "parts" in row and row["truth"][0] >= LEAST_MM]
+    seen = [row["parts"] for row in every if "parts" in row and row["truth"][0] >= LEAST_MM]
     names = seen[0] if seen else ()
     found["bound_by_part"] = {
         name: dict(zip(NAMES, np.sqrt(np.mean([np.square(one[name]) for one in seen], axis=0)), strict=True))
@@ -115,6 +120,8 @@ def words(record: Mapping[str, Any]) -> str:
     """Return what a person wants to know of an assessment, several lines."""
     lines = [f"{record['inclusions']} inclusions, {record['blanks']} blanks of {record['corpus_name']}"]
     for frames in FRAMES:
+        if str(frames) not in record:
+            continue
         for method in METHODS:
             one = record[str(frames)].get(method)
             for size in ("4 mm and more", "8 mm and more"):

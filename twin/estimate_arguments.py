@@ -21,12 +21,13 @@ _ASSESS = """\
 Answer every inclusion of a corpus that a model has not seen (its group named test, else all), from one
 exposure and from the mean of 100, by the network and refined by rendering, and compare with the truth and
 with the smallest error that the pictures allow. Writes report.html, assessment.json and assessment.png. A
-corpus of the same sensor made by full solves or with other light tells what a mismatch costs. A minute or two
+corpus of the same sensor made by full solves or with other light tells what a mismatch costs. Half a minute
 a sample and core; every answer is kept: the same command goes on, also after Ctrl-C. With --curve, a learning
 curve of the light map, which the report of the same DIR shows, too.
 
 examples:
   twin assess models/tsis corpora/pictures --out assessed
+  twin assess models/tsis corpora/pictures --averaged 100 --out assessed
   twin assess models/tsis corpora/pictures --quick --out quick
   twin assess models/tsis corpora/solved --samples 20 --out mismatch
   twin assess models/tsis corpora/pictures --curve --out assessed
@@ -94,6 +95,12 @@ def add(verbs: Any) -> None:
     assess.add_argument("corpus", metavar="CORPUS", help="folder of a finished corpus")
     assess.add_argument("--out", metavar="DIR", help="folder for the assessment")
     assess.add_argument("--samples", type=whole, metavar="N", help="at most so many (default: all)")
+    assess.add_argument(
+        "--averaged",
+        type=whole,
+        metavar="N",
+        help="answer means of 100 exposures, which take far longer, of at most so many (default: all)",
+    )
     assess.add_argument(
         "--curve",
         action="store_true",

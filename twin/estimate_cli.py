@@ -75,12 +75,15 @@ def _assess(arguments: argparse.Namespace) -> int:
     if arguments.curve:
         for flag, given in (
             ("--samples", arguments.samples),
+            ("--averaged", arguments.averaged),
             ("--quick", arguments.quick),
             ("--workers", arguments.workers),
             ("--seed", arguments.seed),
         ):
             if given:
-                raise DesignError(flag, "it with --curve", "none of --samples, --quick, --workers, --seed")
+                raise DesignError(
+                    flag, "it with --curve", "none of --samples, --averaged, --quick, --workers, --seed"
+                )
         with Reporter() as report:
             told = learning_curve.curve(arguments.model, arguments.corpus, arguments.out, progress=report)
         print(learning_curve.words(told))
@@ -92,6 +95,7 @@ def _assess(arguments: argparse.Namespace) -> int:
             arguments.corpus,
             arguments.out,
             samples=arguments.samples,
+            averaged=arguments.averaged,
             rendered=not arguments.quick,
             workers=arguments.workers,
             seed=arguments.seed,
