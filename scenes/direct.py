@@ -26,29 +26,28 @@ from .surface import OpticalSurface, heights
 Array = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
-CELLS = 200  # of the grid of target points, per side
+CELLS = 200  # of the grid of target points, per side, unless another number is asked for
 DISC_POINTS = 24
 _NEWTON_AGAIN = 2  # steps from what the disc's point before foretold
 _FINER = 16  # times the points
 _NEWTON_LAYERS = 5  # in a guide of layers, whose faces a disc may cross
 
 
-def relief(sensor: Sensor, deformed: OpticalSurface) -> Array:
-    """Height (mm) and slopes along x and y of the deformed surface at the targets, (3, CELLS, CELLS)."""
-    half = sensor.guide.width_mm / 2
-    middles = _middles(half)
+def relief(sensor: Sensor, deformed: OpticalSurface, cells: int = CELLS) -> Array:
+    """Height (mm) and slopes along x and y of the deformed surface at the targets, (3, cells, cells)."""
+    middles = _middles(sensor.guide.width_mm / 2, cells)
     height = heights(deformed, middles)
     slope_y, slope_x = (np.gradient(height, middles, axis=axis) for axis in (0, 1))
     return np.stack([height, slope_x, slope_y])
 
 
-def direct(sensor: Sensor, basis: Layered, deformed: OpticalSurface) -> Singles:
-    """Weighted irradiance of the two families, (n_led, layers, CELLS, CELLS), W/mm²; see `on`."""
-    return on(sensor, basis, relief(sensor, deformed))
+def direct(sensor: Sensor, basis: Layered, deformed: OpticalSurface, cells: int = CELLS) -> Singles:
+    """Weighted irradiance of the two families, (n_led, layers, cells, cells), W/mm²; see `on`."""
+    return on(sensor, basis, relief(sensor, deformed, cells))
 
 
 def on(sensor: Sensor, basis: Layered, ground: Array, points: int = DISC_POINTS) -> Singles:
-    """Weighted irradiance of the two families on a `relief`, (n_led, layers, CELLS, CELLS), W/mm²,
+    """Weighted irradiance of the two families on a `relief`, (n_led, layers, cells, cells), W/mm²,
     from so many points of each disc, sixteen times as many where one lies across a face between layers.
 
     From a disc of flux F and area A in a medium of index m, Lambertian or else with its pattern's factor
@@ -60,13 +59,13 @@ def on(sensor: Sensor, basis: Layered, ground: Array, points: int = DISC_POINTS)
     n_led = len(sensor.leds)
     here = [number for number, led in enumerate(sensor.leds) if led.side != "below" and led.flux_W > 0.0]
     if len(here) < n_led:  # light from below crosses both faces at once: it is traced
-        found = np.zeros((n_led, basis.layers, CELLS, CELLS), np.float32)
+        found = np.zeros((n_led, basis.layers, *ground.shape[1:]), np.float32)
         if here:
             some = replace(sensor, leds=tuple(sensor.leds[number] for number in here))
             found[here] = on(some, basis, ground, points)
         return found
     led, where = _targets(sensor, ground)
-    return _maps(at(sensor, basis, led, where, points), n_led)
+    return _maps(at(sensor, basis, led, where, points), n_led, ground)
 
 
 def at(
@@ -81,14 +80,14 @@ def at(
 def answers(
     sensor: Sensor, basis: Layered, ground: Array, change: Change, points: int = DISC_POINTS
 ) -> Array:
-    """Derivative of `on` along a change, (n_led, layers, CELLS, CELLS), W/mm² per unit.
+    """Derivative of `on` along a change, (n_led, layers, cells, cells), W/mm² per unit.
 
     By Dr.Jit's automatic differentiation, forwards, of the very loops that gather: discs move as a whole and
     their points with them. The outline of the side face, of a window in a painted wall, and the faces between
     layers, which cut off light, stay where they are. LEDs below answer nothing.
     """
     here = [number for number, led in enumerate(sensor.leds) if led.side != "below" and led.flux_W > 0.0]
-    found = np.zeros((len(sensor.leds), basis.layers, CELLS, CELLS))
+    found = np.zeros((len(sensor.leds), basis.layers, *ground.shape[1:]))
     if not here:
         return found
     some = replace(sensor, leds=tuple(sensor.leds[number] for number in here))
@@ -103,14 +102,14 @@ def answers(
     dr.forward(step)
     slopes = dr.grad(total)
     dr.eval(slopes)
-    found[here] = _maps(slopes, len(here))
+    found[here] = _maps(slopes, len(here), ground)
     return found
 
 
 @dataclass(frozen=True)
 class Change:
     """What one unit of a parameter changes: the place of every LED along its side and up, mm, and its
-    pattern's exponent; `relief` (3, CELLS, CELLS), or None."""
+    pattern's exponent; `relief` (3, cells, cells), or None."""
 
     along_mm: float = 0.0
     z_mm: float = 0.0
@@ -146,11 +145,11 @@ def _rules(sensor: Sensor, points: int) -> tuple[Array, Array]:
 
 def _targets(sensor: Sensor, ground: Array) -> tuple[mi.UInt32, list[mi.Float]]:
     """LED of each lane, and what it shines at: x, y and the relief."""
-    middles = _middles(sensor.guide.width_mm / 2)
+    middles = _middles(sensor.guide.width_mm / 2, ground.shape[-1])
     x, y = np.meshgrid(middles, middles)
     target = [floats(values) for values in (x, y, *ground)]
-    index = dr.arange(mi.UInt32, len(sensor.leds) * CELLS * CELLS)
-    led, point = index // (CELLS * CELLS), index % (CELLS * CELLS)
+    index = dr.arange(mi.UInt32, len(sensor.leds) * x.size)
+    led, point = index // x.size, index % x.size
     return led, [dr.gather(mi.Float, values, point) for values in target]
 
 
@@ -166,8 +165,8 @@ def _moved(source: Source, change: Change, step: mi.Float) -> Source:
     return replace(source, **moved)
 
 
-def _maps(total: list[mi.Float], n_led: int) -> Singles:
-    return np.stack([np.asarray(layer).reshape(n_led, CELLS, CELLS) for layer in total], axis=1)
+def _maps(total: list[mi.Float], n_led: int, ground: Array) -> Singles:
+    return np.stack([np.asarray(layer).reshape(n_led, *ground.shape[1:]) for layer in total], axis=1)
 
 
 def _summed(
@@ -213,5 +212,5 @@ def _enters(sensor: Sensor, layer: int) -> bool:
     return in_air or any(low < floors[layer] and high > floors[layer + 1] for low, high in ends)
 
 
-def _middles(half: float) -> Array:
-    return (np.arange(CELLS) + 0.5) / CELLS * 2 * half - half
+def _middles(half: float, cells: int) -> Array:
+    return (np.arange(cells) + 0.5) / cells * 2 * half - half

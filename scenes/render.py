@@ -73,7 +73,7 @@ class Rendering:
     from_housing_percent: float = 0.0
     sinks: Array | None = None
     trapped: Array | None = None
-    traced: tuple[Array, ...] | None = None
+    traced: tuple[NDArray[np.floating], ...] | None = None
 
     @property
     def pressure(self) -> NDArray[np.float32]:
@@ -129,6 +129,7 @@ class Renderer:
         samples: int | None = None,
         noise: float | None = None,
         traced: tuple[Array | TracedLight, ...] | None = None,
+        coarse: bool = False,
         place: tuple[Array, Array] | None = None,
         progress: Callable[[float], None] | None = None,
     ) -> Rendering:
@@ -156,6 +157,9 @@ class Renderer:
             own, so that differences of pictures are smooth, and up to 6 % off where LEDs shine in from air
             (`tests/test_forward.py`), 10 % where they are embedded. Or light that was learned from many
             presses (`traced.TracedLight`), which follows the press.
+        coarse
+            With `traced` light: maps of half as many cells a side, in half of the time. What pictures
+            change by from one press to another like it stays right (`tests/test_rendered.py`).
         place
             Centre (3,) and axes (3, 3), mm, of the deformed inclusion (points centre + axes @ u, |u| <= 1) in
             the sensor's frame; None for plain tissue. Only optics of its own, `Sensor.inclusion`, show it.
@@ -170,6 +174,8 @@ class Renderer:
             raise NotModelled(COLOUR)
         from . import build, gather, housing
 
+        if coarse and traced is None:
+            raise ValueError("coarse: received True without traced light; allowed with it")
         if traced is not None:
             housing.refuse(self.sensor, "light that was learned, or is that of another press")
 
@@ -186,7 +192,8 @@ class Renderer:
             found = self._followed(sight, each, seed, effort, place)
         else:
             self.check_leds(shape)
-            found = self._gathered(shape, sight, each, seed, effort, None if traced is None else traced[0])
+            known = None if traced is None else traced[0]
+            found = self._gathered(shape, sight, each, seed, effort, known, coarse)
         return Rendering(
             # the smoothing kernel has negative sides: next to an edge of light they may undershoot the dark
             np.maximum(found.radiance, 0.0).astype(np.float32),
@@ -218,12 +225,23 @@ class Renderer:
         seed: int,
         effort: _Effort,
         known: Array | TracedLight | None,
+        coarse: bool,
     ) -> _Found:
         """Gathered light, and traced light from independent passes, or as it is `known`."""
         from . import direct, gather, trace, transport
 
-        straight = direct.direct(self.sensor, self.basis, shape)
         ground = transport.survey(self.scene, self.sensor)
+        if coarse and known is not None:
+            straight = direct.direct(self.sensor, self.basis, shape, trace.CELLS)
+            if isinstance(known, np.ndarray):
+                walked = transport.coarser(known)
+            else:
+                walked = known.at(self.sensor, shape, ground.fraction, trace.CELLS)
+            with threadpool_limits(1):
+                under = transport.Under.coarse(self.basis, self.behind, ground)
+                seen = under.seen(straight + walked.astype(np.float32, copy=False))
+            return _Found(gather.picture(sight, seen, under.margin), 0.0)
+        straight = direct.direct(self.sensor, self.basis, shape)
         fallen, sums = np.zeros(0), list[Any]()
         with threadpool_limits(1):
             under = transport.Under.at(self.basis, self.behind, ground)
@@ -243,16 +261,15 @@ class Renderer:
             count, noise = effort.spend(glances())
             landed, sinks, trapped, fallen = (total / count for total in sums)
             with threadpool_limits(1):
-                traced = transport.even(landed, transport.GRID // trace.CELLS)
+                traced: NDArray[np.floating] = transport.even(landed, transport.GRID // trace.CELLS)
         elif isinstance(known, np.ndarray):
             noise, traced, sinks, trapped = 0.0, known, None, None
         else:
-            found = known.at(self.sensor, shape, ground.fraction)
-            noise, traced, sinks, trapped = 0.0, found, None, None
+            noise, traced, sinks, trapped = 0.0, known.at(self.sensor, shape, ground.fraction), None, None
         with threadpool_limits(1):
-            seen = under.seen(straight + traced.astype(np.float32))
+            seen = under.seen(straight + traced.astype(np.float32, copy=False))
         effort.tell(1.0)
-        picture = gather.picture(sight, seen, transport.MARGIN)
+        picture = gather.picture(sight, seen, under.margin)
         share = self._add_housing(picture, sight, fallen) if self.sensor.housing.reflects else 0.0
         return _Found(picture, noise, share, sinks, trapped, traced)
 
@@ -312,7 +329,7 @@ class _Found:
     from_housing_percent: float = 0.0
     sinks: Array | None = None
     trapped: Array | None = None
-    traced: Array | None = None
+    traced: NDArray[np.floating] | None = None
 
 
 @dataclass(frozen=True)

@@ -98,7 +98,7 @@ class SpectralRenderer:
         sinks: NDArray[np.float64] | None = None
         trapped = np.zeros(len(self.sensor.leds))
         variance, veil, first = 0.0, 0.0, None
-        walked: list[NDArray[np.float64]] = []
+        walked: list[NDArray[np.floating]] = []
         for number, (band, leds, renderer) in enumerate(
             zip(self.bands, self._leds, self.renderers, strict=True)
         ):

@@ -66,12 +66,13 @@ class TracedLight:
     presses: int
     error_percent: float
 
-    def at(self, sensor: Sensor, shape: OpticalSurface, fraction: Array) -> Single:
+    def at(self, sensor: Sensor, shape: OpticalSurface, fraction: Array, cells: int | None = None) -> Single:
         """Return the traced light of a press, (n_led, layers, g, g) W/mm², in single precision.
 
         Parameters
         ----------
-        fraction : (g, g) real contact fraction on the cells of the maps, `transport.Ground.fraction`.
+        fraction : (g, g) real contact fraction on cells, `transport.Ground.fraction`.
+        cells : g of the maps, if it is not that of the fraction.
 
         Raises
         ------
@@ -90,8 +91,9 @@ class TracedLight:
                 f"traced: received a press {far:.2g} times as far out as those learned; allowed {_BEYOND:g}"
             )
         amounts = (_terms(inputs[None])[0] @ self.weights).astype(np.float32)
-        found = _enlarged(self.mean, fraction.shape[0])
-        found += _enlarged(np.tensordot(amounts, self.modes, 1), fraction.shape[0])
+        cells = cells or fraction.shape[0]
+        found = _enlarged(self.mean, cells)
+        found += _enlarged(np.tensordot(amounts, self.modes, 1), cells)
         found *= np.array([led.flux_W for led in sensor.leds], np.float32)[:, None, None, None]
         return found
 
@@ -259,7 +261,7 @@ def _coarse(cells: Array) -> Array:
     return blocks(cells, _COARSE)
 
 
-def blocks(cells: Array, to: int) -> Array:
+def blocks(cells: NDArray[np.floating], to: int) -> Array:
     """Means over blocks of cells (..., g, g), `to` blocks per side."""
     step = cells.shape[-1] // to
     return np.asarray(cells.reshape(*cells.shape[:-2], to, step, to, step).mean(axis=(-3, -1)))

@@ -270,8 +270,13 @@ class Under:
     @cached_property
     def coarser(self) -> Under:
         """On the cells that walks are counted on."""
-        assert self.behind.coarse is not None
-        return Under.at(self.entrance.basis, self.behind.coarse, self.ground.coarser())
+        return Under.coarse(self.entrance.basis, self.behind, self.ground)
+
+    @staticmethod
+    def coarse(basis: AngularBasis, behind: Behind, ground: Ground) -> Under:
+        """That under a contact on cells of maps, on the cells that walks are counted on."""
+        assert behind.coarse is not None
+        return Under.at(basis, behind.coarse, ground.coarser())
 
     def again(self, landed: NDArray[np.floating]) -> Array:
         """Light that goes up in the tissue, (n_led, modes, m, m), as if it had entered evenly from all

@@ -26,7 +26,8 @@ def seen(design: Design, surface: Any, traced: Any, monkeypatch: pytest.MonkeyPa
 
 
 def test_quick_pictures_change_as_whole_ones(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of binned pixels, pictures are off by 0.005 %, what an inclusion changes by 0.003 % of it."""
+    """Of binned pixels and on coarser maps of light; what an inclusion changes is right to 0.1 %, which is
+    less than the noise of 100 exposures for all that look as alike as 10 noises apart."""
     from scenes import SpectralRenderer, backend
 
     backend.use("cpu")
@@ -43,8 +44,8 @@ def test_quick_pictures_change_as_whole_ones(monkeypatch: pytest.MonkeyPatch) ->
         [seen(design, surface, traced[0], monkeypatch, fast)[0] for surface in both] for fast in (False, True)
     )
     assert whole[0].shape == (2, 41, 64) and quick[0].shape == (1, 41, 64)
-    assert np.sqrt(((quick[0][0] - whole[0][0]) ** 2).mean()) < 2e-4 * whole[0].mean()
+    assert np.sqrt(((quick[0][0] - whole[0][0]) ** 2).mean()) < 2e-3 * whole[0].mean()
     change, same = whole[1][0] - whole[0][0], quick[1][0] - quick[0][0]
     off = np.sqrt(((same - change) ** 2).mean()) / np.sqrt((change**2).mean())
     print(f"change off by {100 * off:.3f} %")
-    assert off < 1e-4
+    assert off < 1.5e-3
