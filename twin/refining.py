@@ -277,7 +277,7 @@ def valley(
             found = _held(chain, features, prior, observed, noise, x, rest, near)
             moved = np.abs(found.x[rest] - x[rest])[:4] / np.sqrt(np.diag(found.spread))
             x = found.x
-            if moved.max() < _FIRST:
+            if moved.max() < _NEAR:
                 break
         return found
 
