@@ -34,7 +34,7 @@ _FIRST, _NEAR = 0.3, 1.0
 error changes, without another."""
 _ALIKE = 0.1  # counts rms, that references are apart whose difference from the map's is the same
 _SHORT = 1e-3  # of the prior's spread: a way that tells nothing of how the error changes
-_REMAINS = 0.05  # of the map's error after its correction nearby (see `tests/test_refining.py`)
+_REMAINS = 0.01  # of the map's error after its correction nearby (see `tests/test_refining.py`)
 _AS_WELL = 1.05  # times wider by the map's error a posterior may be without any rendering
 _STRANGE = 1e-4  # chance of a misfit, below which the noise is taken to be louder than told
 _LOUDEST = 10.0  # times its variance that are believed
@@ -111,6 +111,7 @@ def refine(
             still = _flat(found.x, np.zeros_like(found.pictures))
             return Refined(followed.draw(prior, samples, seed), found, still, True, 0)
     off = _off(chain, prior, found.x, render, quick)
+    remains = _REMAINS**2 * _as_here(features, error, found.pictures, off(found.x)) * error + always
     for renders in range(1, _RENDERS + 1):  # noqa: B007
         at = found.x
         near = _corrected(near, at, off(at), prior)
@@ -165,6 +166,13 @@ def _without_error(
     gain = chain.gain(prior.values(x))
     noise = covariance(chain, features, seen, gain, frames, prior.pattern) + error
     return np.asarray(np.linalg.inv(slopes @ np.linalg.solve(noise, slopes.T) + prior.precision))
+
+
+def _as_here(features: Features, error: Floats, seen: Single, off: Single) -> float:
+    """The variance of the map's error where pictures (levels, 2, r, c) are ``off`` by so much, over its mean
+    everywhere: in the middle of the ranges it is far less than for large inclusions that are not deep."""
+    with_it, without = features(np.stack([seen + off, seen]))
+    return float(np.sum((with_it - without) ** 2, dtype=np.float64) / max(np.trace(error), 1e-30))
 
 
 def _corrected(near: Near | None, at: Floats, off: Single, prior: Prior) -> Near:

@@ -42,9 +42,9 @@ def rendered(
 ) -> Single:
     """Return expected counts above black, (levels, 2, r, c), of one specimen; values as of `chain.contacts`.
 
-    With ``quick``, in a sixth of the time, pictures without references, (levels, 1, r, c), of binned pixels and
-    on coarse maps of light. They are off by 0.15 %, but by the same for specimens that are alike: what they
-    change by is right to 0.1 %, a tenth of the noise of 100 exposures (`tests/test_rendered.py`).
+    With ``quick``, in a fifth of the time, pictures without references, (levels, 1, r, c), of binned pixels
+    and on coarse maps of light. They are off by 0.15 %, but by the same for specimens that are alike: what
+    they change by is right to 0.12 % (`tests/test_rendered.py`).
 
     Raises `fem.NotModelled` outside of the emulator or of the learned light.
     """
