@@ -29,6 +29,7 @@ _STEPS = {"size_mm": 0.02, "depth_mm": 0.02, "modulus_kPa": 0.5, "offset_x_mm": 
 _NUISANCE_STEP = 0.1  # standard deviations
 _MOST = 12  # Gauss-Newton steps
 _DONE = 0.01  # step in standard deviations that ends them
+_AT_END = 1e-9  # of a range: no nearer to its end is told from being there
 
 
 @dataclass(frozen=True)
@@ -281,38 +282,42 @@ def fit(
         rest = observed - features(seen[None])[0]
         information = slopes @ weighted + precision
         slope = weighted.T @ rest - precision @ (x - prior.middle)
-        step = _step(prior, x, information, slope, held)
+        step, cut = _step(prior, x, information, slope, held)
         inverse = np.asarray(np.linalg.inv(information))
         found = Fitted(x, inverse, float(rest @ np.linalg.solve(noise, rest)), seen)
         size = np.abs(step) / np.sqrt(np.diag(inverse))
         x = inside(prior, _stepped(chain, features, prior, x, step, observed, noise, near))
-        if size.max() < _DONE:
+        if size.max() < _DONE and not cut:
             break
     assert found is not None
     return found
 
 
-def _step(prior: Prior, x: Floats, information: Floats, slope: Floats, held: int) -> Floats:
-    """Return the step of Gauss and Newton to the best place that lies within the prior's ranges.
+def _step(prior: Prior, x: Floats, information: Floats, slope: Floats, held: int) -> tuple[Floats, bool]:
+    """Return the step of Gauss and Newton to the best place that lies within the prior's ranges, and whether
+    it is cut short.
 
     What is at the end of its range and wants to go on is held, and the others go where they are best then;
     the step ends where the next one comes to its end.
     """
     low, high = prior.ranges.T
+    tiny = _AT_END * (high - low)
     free = np.arange(len(x)) >= held
     step = np.zeros(len(x))
     for _ in range(len(low) + 1):
         step[:] = 0.0
         step[free] = np.linalg.solve(information[np.ix_(free, free)], slope[free])
         ahead = x[:5] + step[:5]
-        stuck = free[:5] & (((x[:5] <= low) & (ahead < low)) | ((x[:5] >= high) & (ahead > high)))
+        at_low, at_high = x[:5] <= low + tiny, x[:5] >= high - tiny
+        stuck = free[:5] & ((at_low & (ahead < low)) | (at_high & (ahead > high)))
         if not stuck.any():
             break
         free[:5] &= ~stuck
     ends = np.where(step[:5] > 0.0, high, low) - x[:5]
     with np.errstate(divide="ignore", invalid="ignore"):
         shares = np.where(step[:5] != 0.0, ends / step[:5], np.inf)
-    return np.asarray(step * min(1.0, float(shares.min())))
+    share = min(1.0, float(shares.min()))
+    return np.asarray(step * share), share < 1.0
 
 
 def _stepped(
