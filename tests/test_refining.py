@@ -208,7 +208,8 @@ def test_a_start_beside_the_end_of_a_range_is_no_place_to_stay() -> None:
     features: Any = Features()
     x = np.array([7.0, 4.0, 100.0, 0.1, 0.0, 0.0])
     start = np.array([6.5, 4.0 + 1e-7, 70.0, 0.4, 0.3, 0.0])
-    seen = light_map(x) - 0.2 * (light_map(x + np.array([0, 0.2, 0, 0, 0, 0])) - light_map(x))  # asks for less deep
+    deeper = light_map(x + np.array([0, 0.2, 0, 0, 0, 0])) - light_map(x)
+    seen = light_map(x) - 0.2 * deeper  # of one that is not as deep as any
     found = fitting.fit(CHAIN, features, PRIOR, seen, 1.0, start)
     np.testing.assert_allclose(found.x[[0, 1, 3]], x[[0, 1, 3]], atol=0.1)
     assert found.chi_square < 0.1 * K
