@@ -13,6 +13,7 @@ from twin.assess import figures, summed_up
 from twin.assessing_figure import draw
 from twin.assessment import answered, record_of, words
 from twin.complaint import DesignError
+from twin.report import write_json
 
 RANGES = np.array([[2.0, 13.0], [4.0, 12.0], [40.0, 120.0], [-2.0, 2.0], [-2.0, 2.0]])
 SD = np.array([0.1, 0.05, 10.0])
@@ -89,7 +90,7 @@ def test_means_of_some_of_the_samples_are_told_of_these(tmp_path: Any) -> None:
         row.pop("100", None)
     alone = record_of(some, RANGES, True) | {"corpus_name": "made up"}
     assert "100" not in alone and "100 exposures" not in words(alone)
-    (tmp_path / "assessment.json").write_text(json.dumps(alone))
+    write_json(tmp_path / "assessment.json", alone)
     draw({1: answered(some, 1, "rendered")}, RANGES, 5.0, tmp_path / "assessment.png")
     assert "mean of 100" not in assessing_report.write(tmp_path).read_text(encoding="utf-8")
 
@@ -103,7 +104,7 @@ def test_the_page_holds_the_tables_and_a_learning_curve(tmp_path: Any) -> None:
     alone = assessing_report.write(tmp_path).read_text(encoding="utf-8")
     assert "0.0375" in alone and "Errors and the bound" not in alone
     record = record_of(rows(), RANGES, True) | {"corpus_name": "made <up>"}
-    (tmp_path / "assessment.json").write_text(json.dumps(record))
+    write_json(tmp_path / "assessment.json", record)
     drawn = {frames: answered(rows(), frames, "rendered") for frames in (1, 100)}
     draw(drawn, RANGES, 5.0, tmp_path / "assessment.png")
     page = assessing_report.write(tmp_path)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from twin.assess import FRAMES, LEAST_MM
-from twin.assessment import METHODS
+from twin.assessment import METHODS, span
 from twin.estimates import NAMES
 from twin.report import Page
 
@@ -122,7 +122,7 @@ def _presence(page: Page, record: Mapping[str, Any]) -> None:
     rows = []
     for frames in _there(record):
         for cell in record[str(frames)]["presence"].get("beside_ideal") or ():
-            size, depth = (_span(*cell[name]) for name in ("size_mm", "depth_mm"))
+            size, depth = (span(*cell[name]) for name in ("size_mm", "depth_mm"))
             figures = [f"{cell['area']:.3f}", f"{cell['ideal']:.3f}"]
             rows.append([_EXPOSURES[frames], size, depth, cell["inclusions"], *figures])
     if rows:
@@ -160,7 +160,3 @@ def _curve(page: Page, curve: Mapping[str, Any] | None, folder: Path) -> None:
         [len(rows) - 1],
     )
     page.picture((folder / CURVED).read_bytes(), "The same, over the number of samples.")
-
-
-def _span(low: float, high: float) -> str:
-    return f"{low:g} mm and more" if high > 1e3 else f"{low:g} to {high:g} mm"

@@ -16,7 +16,6 @@ from twin.estimates import NAMES
 METHODS = ("network", "rendered")
 SHORT = ("mean", "sd", "low", "high", "rank")
 """Fields of `Answers`, as a sample's record holds them."""
-_ALL = 1e3
 SIZES = ((2.0, 3.0), (3.0, 4.0), (4.0, 8.0), (8.0, np.inf))
 DEPTHS = ((0.0, 8.0), (8.0, np.inf))
 """Sizes and depths, mm, by which presence is told."""
@@ -146,7 +145,7 @@ def words(record: Mapping[str, Any]) -> str:
                 f"      inclusion or none: area under the curve {presence['area']:.4f}; by size and depth:"
             )
             for cell in presence["beside_ideal"]:
-                size, depth = (_span(*cell[name]) for name in ("size_mm", "depth_mm"))
+                size, depth = (span(*cell[name]) for name in ("size_mm", "depth_mm"))
                 lines.append(
                     f"        {cell['inclusions']:>3} of {size}, {depth} deep: {cell['area']:.3f}, "
                     f"ideal observer {cell['ideal']:.3f}"
@@ -158,5 +157,6 @@ def words(record: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _span(low: float, high: float) -> str:
-    return f"{low:g} mm and more" if high > _ALL else f"{low:g} to {high:g} mm"
+def span(low: float, high: float | None) -> str:
+    """Say from where to where; files have no infinity but None."""
+    return f"{low:g} mm and more" if high is None or high == np.inf else f"{low:g} to {high:g} mm"

@@ -93,6 +93,7 @@ def test_valid_pictures_are_taken_and_others_refused(estimator: Estimator, corpu
     assert found.total() >= 0.95 * len(strange)
 
 
+@pytest.mark.timeout(3600)
 def test_another_camera_that_stands_off_is_within_twice_the_error(
     estimator: Estimator, corpus: twin.Corpus
 ) -> None:
