@@ -240,6 +240,7 @@ class Renderer:
             with threadpool_limits(1):
                 under = transport.Under.coarse(self.basis, self.behind, ground)
                 seen = under.seen(straight + walked.astype(np.float32, copy=False))
+            effort.tell(1.0)
             return _Found(gather.picture(sight, seen, under.margin), 0.0)
         straight = direct.direct(self.sensor, self.basis, shape)
         fallen, sums = np.zeros(0), list[Any]()

@@ -215,6 +215,25 @@ def test_a_start_beside_the_end_of_a_range_is_no_place_to_stay() -> None:
     assert found.chi_square < 0.1 * K
 
 
+@pytest.mark.parametrize("damped", [True, False])
+def test_a_fit_goes_along_a_thin_bent_valley(damped: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Size is known as a parabola of the modulus, 3000 times as well as the modulus: no share of a plain step
+    stays on that parabola, so that fits without damped steps hardly move; with them they go on."""
+
+    def bent(chain: Any, prior: Prior, many: Any, near: Any = None) -> NDArray[Any]:
+        d, h, e, ox, oy, t = np.moveaxis(np.array(many, float), -1, 0)
+        parts = [(d - 6.0 - 0.5 * ((e - 80.0) / 20.0) ** 2) * 3e3, e, h, ox, oy, t, 0 * t, 0 * t]
+        return (NOISE * np.stack(parts, axis=-1)).reshape(-1, *Features.shape)
+
+    monkeypatch.setattr(fitting, "expected", bent)
+    if not damped:
+        monkeypatch.setattr(fitting, "_DAMPED", ())
+    features: Any = Features()
+    x, start = np.array([6.0, 6.0, 80.0, 0, 0, 0]), np.array([7.125, 6.0, 110.0, 0, 0, 0])
+    found = fitting.fit(CHAIN, features, PRIOR, features(bent(CHAIN, PRIOR, [x]))[0], 1.0, start)
+    assert (found.x[2] < 100.0) == damped
+
+
 def test_what_cannot_be_rendered_is_not_explained() -> None:
     features: Any = Features()
     x = np.array([9.0, 6.0, 80.0, 0.3, -0.2, 0.0])

@@ -1,8 +1,8 @@
 """The model-based estimator: the most probable specimen by the chain, and the bound from the same chain.
 
 Pictures are features (`estimation.features`) with normal noise; what is not known has a normal prior, the
-inclusion's that of a uniform draw from its ranges. Gauss-Newton steps with halving lead to the most probable
-values (Kay 1993, section 11.5; [kay1993]); derivatives are central differences of the chain.
+inclusion's that of a uniform draw from its ranges. Gauss-Newton steps, shortened or damped, lead to the most
+probable values (Kay 1993, section 11.5; [kay1993]); derivatives are central differences of the chain.
 """
 
 from __future__ import annotations
