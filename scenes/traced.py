@@ -2,10 +2,10 @@
 
 Light that is not gathered has walked far through the guide and carries the Monte Carlo noise, which in blocks
 of pixels is above the camera's (`tests/test_traced.py`). It changes little and smoothly from press to press:
-here its maps are a mean plus a few modes, whose amounts are a quadratic of the leading principal components
-of real contact fraction and displacement (reduced-rank regression: Izenman 1975; [izenman1975]). A picture
-that takes it (`Renderer.render(traced=...)`) has no noise of its own and is the same function of the press
-every time, so that pictures can be compared and differentiated.
+here its maps are a mean plus a few modes, whose amounts are smooth functions (`kriging`) of the leading
+principal components of real contact fraction and displacement. A picture that takes it
+(`Renderer.render(traced=...)`) has no noise of its own and is the same function of the press every time, so
+that pictures can be compared and differentiated.
 """
 
 from __future__ import annotations
@@ -18,24 +18,29 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from . import kriging
 from .sensor import NotModelled, Sensor
 from .surface import OpticalSurface
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 
-_INPUTS, _CURVED = 10, 4  # principal components, and how many of them go in with squares and products
-_MODES = 10
+_INPUTS = 10  # principal components
+_DISPLACED = 2.0  # weight of displacements among them, that of contact fractions is 1
+_LEADING, _AREAS, _OUTPUTS = 4, 5, 30
+"""What lengths are found from: leading maps of the light, areas per side, their principal components."""
+_MODES = 16
+_FEWEST = 40  # presses
 _COARSE = 50  # cells per side on which modes are kept
 _FINE = 100  # on which their mean is
 _BEYOND = 2.0  # how far inputs may leave what was learned, times its reach
-FORMAT = "tsis-traced-2"
+FORMAT = "tsis-traced-3"
 LIGHT = 7
 """Counts up when pictures of the same press change: what was learned or kept before is of no use then."""
 BIAS_SINCE = 5
 """The first light of which a quality's measured bias holds: what changed since is common to all qualities, or
 less than the bias is known to (LIGHT 7: 0.11 % in a blob, 0.09 % in a background)."""
-ARRAYS = ("centre", "axes", "reach", "weights", "mean", "modes")
+ARRAYS = ("centre", "axes", "nodes", "weights", "mean", "modes")
 """Fields of `TracedLight` that are arrays."""
 
 
@@ -46,25 +51,29 @@ class TracedLight:
     Attributes
     ----------
     key : of the sensor's optics (`optics_key`); light of another is refused.
-    centre, axes : (d,) and (d, inputs); inputs of a press are (its description - centre) @ axes.
-    reach : (inputs,) largest magnitude learned.
-    weights : (terms, modes) amounts of the modes.
+    centre, axes : (d,) and (d, inputs); inputs of a press are (its description - centre) @ axes, in units of
+        the lengths over which light changes.
+    nodes : (presses, inputs) of those that were learned.
+    weights : (1 + presses, modes) amounts of the modes, of `kriging.terms`.
     mean : (n_led, layers, m, m), 1/mm².
     modes : (modes, n_led, layers, 50, 50), 1/mm².
-    presses : how many were learned.
-    error_percent : root mean square over the presses, each left out in turn, of the error of all traced light
-        together, in per cent of it; the noise of what was traced is in it.
+    error_percent : root mean square over the presses, each left out in turn, of the error of the leading map,
+        all of it together, in per cent; the noise of what was traced is in it.
     """
 
     key: str
     centre: Array
     axes: Array
-    reach: Array
+    nodes: Array
     weights: Array
     mean: Single
     modes: Single
-    presses: int
     error_percent: float
+
+    @property
+    def presses(self) -> int:
+        """How many were learned."""
+        return len(self.nodes)
 
     def at(self, sensor: Sensor, shape: OpticalSurface, fraction: Array, cells: int | None = None) -> Single:
         """Return the traced light of a press, (n_led, layers, g, g) W/mm², in single precision.
@@ -85,12 +94,12 @@ class TracedLight:
                 "sensor's own"
             )
         inputs = (describe(shape, fraction) - self.centre) @ self.axes
-        far = float(np.max(np.abs(inputs) / self.reach))
+        far = float(np.max(np.abs(inputs) / np.abs(self.nodes).max(axis=0)))
         if far > _BEYOND:
             raise NotModelled(
                 f"traced: received a press {far:.2g} times as far out as those learned; allowed {_BEYOND:g}"
             )
-        amounts = (_terms(inputs[None])[0] @ self.weights).astype(np.float32)
+        amounts = (kriging.terms(inputs[None], self.nodes)[0] @ self.weights).astype(np.float32)
         cells = cells or fraction.shape[0]
         found = _enlarged(self.mean, cells)
         found += _enlarged(np.tensordot(amounts, self.modes, 1), cells)
@@ -146,19 +155,16 @@ def learn(
     traced : n maps (n_led, layers, g, g), W/mm², `Rendering.traced` of one band.
     """
     n = len(traced)
-    terms = _terms(np.zeros((1, _INPUTS))).shape[1]
-    if n < 2 * terms or len(descriptions) != n:
-        raise ValueError(f"traced: received {n} maps; allowed {2 * terms} or more, one for each description")
+    if n < _FEWEST or len(descriptions) != n:
+        raise ValueError(f"traced: received {n} maps; allowed {_FEWEST} or more, one for each description")
     x = np.asarray(descriptions, np.float64)
     centre = x.mean(axis=0)
     x = x - centre
     cells = _COARSE**2
-    scale = np.concatenate(
-        [np.full(cells, x[:, :cells].std()), np.full(x.shape[1] - cells, x[:, cells:].std())]
-    )
+    moved = x[:, cells:].std() / _DISPLACED
+    scale = np.concatenate([np.full(cells, x[:, :cells].std()), np.full(x.shape[1] - cells, moved)])
     _, size, axes = np.linalg.svd(x / scale, full_matrices=False)
     axes = axes[:_INPUTS].T / scale[:, None] * (np.sqrt(n) / size[:_INPUTS])
-    inputs = x @ axes
     flux = np.array([led.flux_W for led in sensor.leds])[:, None, None, None]
     fine = min(traced[0].shape[-1], _FINE)
     mean = np.zeros((*traced[0].shape[:2], fine, fine))
@@ -167,27 +173,36 @@ def learn(
         per_watt = np.asarray(maps, np.float64) / flux
         mean += blocks(per_watt, fine) / n
         coarse[number] = blocks(per_watt, _COARSE)
+    lengths, noise = kriging.lengths(x @ axes, _leading(coarse))
+    axes = axes / lengths
+    nodes = x @ axes
+    total = coarse[:, :, 0].sum(axis=(1, 2, 3), dtype=np.float64)
+    missed = kriging.left_out(nodes, (total - total.mean())[:, None], noise)[:, 0] / total
     flat = coarse.reshape(n, -1)
-    middle = flat.mean(axis=0)
-    a = _terms(inputs)
-    hat = a @ np.linalg.pinv(a)
-    total = flat.sum(axis=1, dtype=np.float64)
-    left_out = (total - hat @ total) / (1.0 - np.diag(hat)) / total
-    fitted = (hat @ (flat - middle)).astype(np.float32)
+    flat -= flat.mean(axis=0)
+    weigh = kriging.weights(nodes, np.eye(n), noise)  # the maps are many: weights of the presses, then theirs
+    fitted = (kriging.terms(nodes, nodes) @ weigh).astype(np.float32) @ flat
     values, vectors = np.linalg.eigh(np.asarray(fitted @ fitted.T, np.float64))
-    leading = vectors[:, np.argsort(values)[::-1][:_MODES]]
-    modes = (leading.T @ fitted).reshape(-1, *coarse.shape[1:])
+    first = np.argsort(values)[::-1][:_MODES]
+    modes = vectors[:, first].T.astype(np.float32) @ fitted
     return TracedLight(
         optics_key(sensor),
         centre,
         axes,
-        np.abs(inputs).max(axis=0),
-        np.linalg.pinv(a) @ leading,
+        nodes,
+        weigh @ (flat @ modes.T) / values[first],
         mean.astype(np.float32),
-        modes.astype(np.float32),
-        n,
-        100.0 * float(np.sqrt(np.mean(left_out**2))),
+        modes.reshape(-1, *coarse.shape[1:]),
+        100.0 * float(np.sqrt(np.mean(missed**2))),
     )
+
+
+def _leading(maps: Single) -> Array:
+    """What tells of lengths in light (n, n_led, layers, 50, 50), (n, 30): principal components of the leading
+    maps' means over areas, which have little noise."""
+    areas = blocks(maps[:, :, :_LEADING], _AREAS).reshape(len(maps), -1)
+    left, size, _ = np.linalg.svd(areas - areas.mean(axis=0), full_matrices=False)
+    return np.asarray(left[:, :_OUTPUTS] * size[:_OUTPUTS])
 
 
 def save(light: Sequence[TracedLight], path: str | Path) -> None:
@@ -216,45 +231,32 @@ def load(path: str | Path) -> tuple[TracedLight, ...]:
 
 def _one(file: np.lib.npyio.NpzFile, number: int) -> TracedLight:
     arrays = {name: file[f"{number}.{name}"] for name in (*ARRAYS, "error_percent")}
-    return assembled(
-        arrays, str(file[f"{number}.key"]), int(file[f"{number}.presses"]), float(arrays["error_percent"])
-    )
+    return assembled(arrays, str(file[f"{number}.key"]), float(arrays["error_percent"]))
 
 
-def assembled(
-    arrays: Mapping[str, NDArray[np.generic]], key: str, presses: int, error_percent: float
-) -> TracedLight:
+def assembled(arrays: Mapping[str, NDArray[np.generic]], key: str, error_percent: float) -> TracedLight:
     """Return learned light from its `ARRAYS` and the rest; raises ValueError where they do not fit."""
     for name in ARRAYS:
         if arrays[name].dtype.kind != "f" or not np.isfinite(arrays[name]).all():
             raise ValueError(name)
     if arrays["axes"].ndim != 2 or not np.isfinite(error_percent):
         raise ValueError("axes, error_percent")
-    centre, axes, reach, weights = (
-        np.asarray(arrays[name], np.float64) for name in ("centre", "axes", "reach", "weights")
+    centre, axes, nodes, weights = (
+        np.asarray(arrays[name], np.float64) for name in ("centre", "axes", "nodes", "weights")
     )
     mean, modes = (np.asarray(arrays[name], np.float32) for name in ("mean", "modes"))
     k, m = axes.shape[1], len(modes)
     fits = (
         axes.shape == (len(centre), _INPUTS)
-        and reach.shape == (k,)
-        and (reach > 0).all()
-        and weights.shape == (_terms(np.zeros((1, k))).shape[1], m)
+        and nodes.shape == (len(nodes), k)
+        and weights.shape == (1 + len(nodes), m)
         and mean.ndim == 4
         and mean.shape[-1] == mean.shape[-2]
         and modes.shape == (m, *mean.shape[:2], _COARSE, _COARSE)
     )
     if not fits:
         raise ValueError("shapes")
-    return TracedLight(key, centre, axes, reach, weights, mean, modes, presses, error_percent)
-
-
-def _terms(inputs: Array) -> Array:
-    """One, the inputs, and squares and products of the leading ones, (n, terms)."""
-    products = [
-        inputs[:, i] * inputs[:, j] - float(i == j) for i in range(_CURVED) for j in range(i, _CURVED)
-    ]
-    return np.column_stack([np.ones(len(inputs)), inputs, *products])
+    return TracedLight(key, centre, axes, nodes, weights, mean, modes, error_percent)
 
 
 def _coarse(cells: Array) -> Array:

@@ -111,7 +111,8 @@ def test_hostile_files_are_refused(learned, tmp_path):
     for change in (
         {"modes": learned.modes[:, :1]},
         {"centre": learned.centre * np.nan},
-        {"reach": -learned.reach},
+        {"nodes": learned.nodes[:, :1]},
+        {"nodes": learned.nodes[1:]},
     ):
         traced.save([replace(learned, **change)], place)
         with pytest.raises(NotModelled, match="no traced light"):
@@ -121,7 +122,7 @@ def test_hostile_files_are_refused(learned, tmp_path):
 def test_files_of_an_older_format_are_refused_in_one_line(learned, tmp_path, monkeypatch):
     place = tmp_path / "light.npz"
     with monkeypatch.context() as older:
-        older.setattr(traced, "FORMAT", "tsis-traced-1")
+        older.setattr(traced, "FORMAT", "tsis-traced-2")
         traced.save([learned], place)
         assert len(traced.load(place)) == 1  # it was whole in its time
     with pytest.raises(DesignError, match=r"traced: received .*; allowed a file of") as refused:

@@ -32,7 +32,7 @@ from twin.design import parse_design
 from twin.estimator import Estimator, Sight
 from twin.fitting import Prior
 
-FORMAT = "tsis-estimator-2"
+FORMAT = "tsis-estimator-3"
 _FEATURES = ("mean", "axes", "noise", "spread")
 _CARD_BYTES = 4 * 2**20
 _NEEDED = {
@@ -232,7 +232,6 @@ def _assembled(card: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Estimat
         traced.assembled(
             {name: arrays[f"traced.{number}.{name}"] for name in traced.ARRAYS},
             str(said["key"]),
-            int(said["presses"]),
             float(said["error_percent"]),
         )
         for number, said in enumerate(card["traced"])
