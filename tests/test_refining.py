@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy import linalg, optimize
 
 from twin import fitting, refining
 from twin.fitting import Prior
@@ -232,6 +233,30 @@ def test_a_fit_goes_along_a_thin_bent_valley(damped: bool, monkeypatch: pytest.M
     x, start = np.array([6.0, 6.0, 80.0, 0, 0, 0]), np.array([7.125, 6.0, 110.0, 0, 0, 0])
     found = fitting.fit(CHAIN, features, PRIOR, features(bent(CHAIN, PRIOR, [x]))[0], 1.0, start)
     assert (found.x[2] < 100.0) == damped
+
+
+@pytest.mark.parametrize("modulus", [65.0, 75.0, 115.0])
+def test_all_else_is_most_probable_with_the_modulus_held_and_the_depth_at_its_end(modulus: float) -> None:
+    """The pictures ask for more depth than the range has: size, offsets and gain go where they are best then,
+    as a bounded minimiser finds it."""
+    observed = light_map(np.array([7.0, 12.15, 60.0, 1.0, -1.5, 0.5]))
+    noise = linalg.cho_factor(np.eye(K) * 1e-6)
+    rest, features = np.array([0, 1, 3, 4, 5]), Features()
+    start = np.array([7.0, 11.9, modulus, 1.0, -1.5, 0.0])
+
+    def cost(others: NDArray[np.float64]) -> float:
+        x = np.insert(others, 2, modulus)
+        off = (x - PRIOR.middle)[rest]
+        away = observed - light_map(x)
+        return float(away @ away / 1e-6 + off @ PRIOR.precision[np.ix_(rest, rest)] @ off)
+
+    best = optimize.minimize(
+        cost, start[rest], method="L-BFGS-B", bounds=[*RANGES[[0, 1, 3, 4]], (-4, 4)], options={"ftol": 1e-14}
+    )
+    near = refining._flat(start, np.zeros(Features.shape, np.float32))
+    found = refining._held(CHAIN, features, PRIOR, observed, noise, start, rest, near)  # type: ignore[arg-type]
+    assert found.x[1] == 12.0
+    assert cost(found.x[rest]) < best.fun + 0.1
 
 
 def test_what_cannot_be_rendered_is_not_explained() -> None:

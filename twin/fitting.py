@@ -286,12 +286,13 @@ def fit(
         rest = observed - features(seen[None])[0]
         information = slopes @ weighted + precision
         slope = weighted.T @ rest - precision @ (x - prior.middle)
-        step, cut = _step(prior, x, information, slope, held)
+        free = np.arange(len(x)) >= held
+        step, cut = step_inside(prior, x, information, slope, free)
         inverse = np.asarray(np.linalg.inv(information))
         found = Fitted(x, inverse, float(rest @ np.linalg.solve(noise, rest)), seen)
         size = np.abs(step) / np.sqrt(np.diag(inverse))
         steps = [share * step for share in _SHARES]
-        steps += [_step(prior, x, information + more * precision, slope, held)[0] for more in _DAMPED]
+        steps += [step_inside(prior, x, information + more * precision, slope, free)[0] for more in _DAMPED]
         x = _stepped(chain, features, prior, x, steps, observed, noise, near)
         if size.max() < _DONE and not cut:
             break
@@ -299,16 +300,17 @@ def fit(
     return found
 
 
-def _step(prior: Prior, x: Floats, information: Floats, slope: Floats, held: int) -> tuple[Floats, bool]:
+def step_inside(
+    prior: Prior, x: Floats, information: Floats, slope: Floats, free: NDArray[np.bool_]
+) -> tuple[Floats, bool]:
     """Return the step of Gauss and Newton to the best place that lies within the prior's ranges, and whether
-    it is cut short.
+    it is cut short; what is not free (5 + q,) stays.
 
     What is at the end of its range and wants to go on is held, and the others go where they are best then;
     the step ends where the next one comes to its end.
     """
     low, high = prior.ranges.T
-    tiny = _AT_END * (high - low)
-    free = np.arange(len(x)) >= held
+    tiny, free = _AT_END * (high - low), free.copy()
     step = np.zeros(len(x))
     for _ in range(len(low) + 1):
         step[:] = 0.0

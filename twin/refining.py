@@ -22,7 +22,20 @@ from scipy.interpolate import CubicSpline, interp1d
 
 from estimation.features import Features
 from twin.chain import Chain
-from twin.fitting import ALIGNMENT, Fitted, Near, Prior, covariance, expected, fit, inside, jacobian, placed
+from twin.fitting import (
+    ALIGNMENT,
+    Fitted,
+    Near,
+    Prior,
+    covariance,
+    expected,
+    fit,
+    inside,
+    jacobian,
+    placed,
+    step_inside,
+)
+from twin.study import PARAMETERS
 
 Floats = NDArray[np.float64]
 Single = NDArray[np.float32]
@@ -123,6 +136,7 @@ def refine(
     assert near is not None
     louder = found.chi_square / len(features.spread) if _strange(found, features) else 1.0
 
+    remains = remains + (louder - 1.0) * always  # told by few pictures, it may be too small itself
     followed, more = valley(chain, features, prior, observed, frames, found, remains, off, louder)
     return Refined(followed.draw(prior, samples, seed), found, near, bool(louder < _LOUDEST), renders + more)
 
@@ -136,8 +150,9 @@ def _off(
 ) -> Callable[[Floats], Single]:
     """By how much rendered pictures are above the chain's at unknowns (5 + q,).
 
-    Quickly, from what is rendered ``at`` a specimen, as long as the references stay as they are there: along
-    the valley only the inclusion changes, which they do not show.
+    Quickly, from what is rendered ``at`` a specimen, as long as the references are about as they are there:
+    along the valley only the inclusion changes, which they do not show. What else changes a little is left
+    as it was: it moves picture and reference alike, and their difference would pass for an inclusion's.
     """
     values, plain = prior.values(at), expected(chain, prior, [at])[0]
     aside = any(name in prior.names for name in ALIGNMENT)
@@ -152,7 +167,8 @@ def _off(
             return np.asarray(placed(render(new)[None], [new])[0] - seen, np.float32)
         if not begins:
             begins.append((first + plain)[:, :1] - quick(values))
-        pressed = begins[0] + quick(new) - seen[:, :1]
+        alone = np.concatenate([x[: len(PARAMETERS)], at[len(PARAMETERS) :]])
+        pressed = begins[0] + quick(prior.values(alone)) - expected(chain, prior, [alone])[0][:, :1]
         return np.concatenate([pressed, first[:, 1:]], axis=1)
 
     return off
@@ -351,26 +367,28 @@ def _held(
     rest: NDArray[np.intp],
     near: Near,
 ) -> _Node:
-    """Most probable unknowns with the modulus held; steps that lead up are halved."""
-    precision = prior.precision[np.ix_(rest, rest)]
+    """Most probable unknowns with the modulus held, within the prior's ranges; steps that lead up are
+    halved."""
+    precision = prior.precision
+    free = np.arange(len(start)) != _HELD
     x, least, best = inside(prior, start), np.inf, None
     for _ in range(_STEPS):
         seen, slopes = jacobian(chain, features, prior, x, near)
-        away, off = observed - features(seen[None])[0], (x - prior.middle)[rest]
-        cost = float(away @ linalg.cho_solve(noise, away) + off @ precision @ off)
+        away, off = observed - features(seen[None])[0], x - prior.middle
+        pull = precision @ off
+        cost = float(away @ linalg.cho_solve(noise, away) + off[rest] @ pull[rest])
         if best is not None and cost > least:
             x = inside(prior, 0.5 * (x + best.x))
             continue
-        weighted = linalg.cho_solve(noise, slopes[rest].T)
-        inverse = np.linalg.inv(slopes[rest] @ weighted + precision)
+        weighted = linalg.cho_solve(noise, slopes.T)
+        information = slopes @ weighted + precision
+        inverse = np.linalg.inv(information[np.ix_(rest, rest)])
         # the ranges are flat; their normal stand-in only bounds what the pictures do not tell
         log_density = -0.5 * cost + 0.5 * float(np.linalg.slogdet(inverse)[1])
         least, best = cost, _Node(x, log_density, inverse[:4, :4], near)
-        step = inverse @ (weighted.T @ away - precision @ off)
-        if np.abs(step / np.sqrt(np.diag(inverse)))[:4].max() < _STILL:
+        step, _ = step_inside(prior, x, information, weighted.T @ away - pull, free)
+        if np.abs(step[rest] / np.sqrt(np.diag(inverse)))[:4].max() < _STILL:
             break
-        x = x.copy()
-        x[rest] += step
-        x = inside(prior, x)
+        x = inside(prior, x + step)
     assert best is not None
     return best
