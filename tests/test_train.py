@@ -13,6 +13,7 @@ import twin
 from twin import index, sample, store
 from twin.calibrate import _drawn, calibrate, calibrated
 from twin.complaint import DesignError
+from twin.discrepancy import Discrepancy
 from twin.estimator import Estimator, Sight, black
 from twin.estimator_file import emulator_of, load_estimator, save_estimator
 from twin.imagined import Brightness, mean_variance, pictures
@@ -165,14 +166,20 @@ def test_a_calibrated_model_is_kept_and_read(model, tmp_path):
     estimator = load_estimator(model)
     shape = estimator.features.shape
     noise = np.ones(shape, np.float32) * estimator.features.noise
-    sight = Sight(replace(estimator.features, noise=noise), estimator.error, 2.0 * estimator.error)
+    sight = Sight(
+        replace(estimator.features, noise=noise),
+        estimator.error,
+        Discrepancy(2.0 * estimator.error, estimator.error),
+    )
     place = tmp_path / "m.safetensors"
     save_estimator(replace(estimator, calibration=sight), emulator_of(model), place)
     again = load_estimator(place).calibration
-    assert again is not None and np.array_equal(again.discrepancy, sight.discrepancy)
+    assert again is not None and again.discrepancy is not None
+    inclusion = np.stack([np.full((2, 2), 3.0), np.zeros((2, 2))])[None]
+    assert np.allclose(again.off(inclusion), (2.0 + 3.0) * estimator.error)
     pictures = np.random.default_rng(0).random((2, *shape), np.float32)
     assert np.array_equal(again.features(pictures), estimator.features(pictures))
-    wrong = replace(sight, discrepancy=np.eye(3))
+    wrong = replace(sight, discrepancy=Discrepancy(estimator.error, np.eye(3)))
     save_estimator(replace(estimator, calibration=wrong), emulator_of(model), place)
     with pytest.raises(DesignError, match="do not fit"):
         load_estimator(place)

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 _LABELS = ("size d / mm", "depth h / mm", "modulus E / kPa")
 _COLOURS = (BLUE, RED)
 _BINS = 10
+_MOST = 97.0  # per cent of the intervals that errors are drawn to the ends of
 
 
 def draw(
@@ -28,26 +29,12 @@ def draw(
 ) -> None:
     """Draw answers by exposures, `ranges` (5, 2) of the parameters, into a PNG file."""
     figure, axes = panels(2, 3, 3.5)
-    for number, (axis, label) in enumerate(zip(axes, _LABELS, strict=False)):
-        axis.plot(ranges[number], ranges[number], color=GREY, lw=0.8)
-        for (frames, one), colour in zip(answered.items(), _COLOURS, strict=False):
-            mean, truth = one.answers.mean[:, number], one.truth[:, number]
-            off = np.abs([one.answers.low[:, number], one.answers.high[:, number]] - mean)
-            axis.errorbar(
-                truth,
-                mean,
-                off,
-                fmt="o",
-                ms=2.2,
-                color=colour,
-                ecolor=colour,
-                elinewidth=0.5,
-                alpha=0.6,
-                label=_exposures(frames),
-            )
-        axis.set(
-            xlabel=f"true {label}", ylabel=f"estimated {label}", xlim=ranges[number], ylim=ranges[number]
-        )
+    _errors(axes[0], answered, ranges[0], 0, "error of size d / mm")
+    _errors(axes[1], answered, ranges[1], 1, "error of depth h / mm")
+    axes[2].plot(ranges[2], ranges[2], color=GREY, lw=0.8)
+    for (_, one), colour in zip(answered.items(), _COLOURS, strict=False):
+        _bars(axes[2], one, 2, 0.0, colour)
+    axes[2].set(xlabel=f"true {_LABELS[2]}", ylabel=f"estimated {_LABELS[2]}", xlim=ranges[2], ylim=ranges[2])
     axes[0].legend(frameon=False, fontsize=8)
     _widths(axes[3], answered, ranges, tissue_kPa)
     _ratios(axes[4], answered)
@@ -55,6 +42,38 @@ def draw(
     for axis in axes:
         axis.title.set_fontsize(9)
     figure.savefig(place, dpi=130)
+
+
+def _errors(
+    axis: Axes, answered: Mapping[int, Answered], span: NDArray[np.float64], number: int, label: str
+) -> None:
+    """Estimate minus truth, which beside the truth itself would be too small to see."""
+    axis.axhline(0.0, color=GREY, lw=0.8)
+    reach, beyond = 0.0, 0
+    for (frames, one), colour in zip(answered.items(), _COLOURS, strict=False):
+        truth = one.truth[:, number]
+        _bars(axis, one, number, truth, colour, _exposures(frames))
+        ends = np.abs([one.answers.low[:, number] - truth, one.answers.high[:, number] - truth]).max(axis=0)
+        reach = max(reach, 1.1 * float(np.percentile(ends, _MOST)))
+    for one in answered.values():
+        beyond += int((np.abs(one.answers.mean[:, number] - one.truth[:, number]) > reach).sum())
+    title = f"{beyond} farther off are not shown" if beyond else ""
+    axis.set(xlabel=f"true {_LABELS[number]}", ylabel=label, xlim=span, ylim=(-reach, reach), title=title)
+
+
+def _bars(
+    axis: Axes,
+    one: Answered,
+    number: int,
+    less: NDArray[np.float64] | float,
+    colour: str,
+    label: str | None = None,
+) -> None:
+    """Means with their 90 % intervals, less so much, over the truth."""
+    mean = one.answers.mean[:, number]
+    off = np.abs([one.answers.low[:, number], one.answers.high[:, number]] - mean)
+    look = {"fmt": "o", "ms": 2.2, "color": colour, "ecolor": colour, "elinewidth": 0.5, "alpha": 0.6}
+    axis.errorbar(one.truth[:, number], mean - less, off, label=label, **look)
 
 
 def _widths(

@@ -16,7 +16,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 from scipy.ndimage import gaussian_filter
 
 from estimation.features import compress
@@ -25,6 +24,7 @@ from twin.assessing import Sample, levels_of, loaded, one_thread, opened
 from twin.chain import BLOCK, whole_blocks
 from twin.complaint import DesignError, shown
 from twin.corpus import Corpus
+from twin.discrepancy import shrunk, told_by
 from twin.estimator import Estimator, Sight
 from twin.estimator_file import emulator_of, file_of, load_estimator, save_estimator
 from twin.fitting import inside, reachable
@@ -39,8 +39,6 @@ Single = NDArray[np.float32]
 
 LEAST = 12
 """Samples that a calibration needs."""
-_SHARES = (1e-3, 3e-3, 0.01, 0.03, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.97)
-_COMMON = (0.01, 0.1, 0.25, 0.5, 0.75, 1.0)
 _NEAR = 1.5  # blocks over which squared differences are averaged: few samples tell each block's badly
 
 
@@ -133,8 +131,8 @@ def calibrated(estimator: Estimator, values: list[dict[str, float]], seen: Singl
     apart = np.stack([off[:, :, 0] - off[:, :, 1], off[:, :, 1]], axis=2)
     missed = gaussian_filter((apart**2).mean(axis=0), (0.0, 0.0, _NEAR, _NEAR))
     features = compress(many, np.sqrt(np.stack([noise.sum(axis=1), noise[:, 1]], axis=1) + missed))
-    told, rendered_, learned = (features(one).astype(np.float64) for one in (seen, own, mapped))
-    sight = Sight(features, shrunk(rendered_ - learned), shrunk(told - rendered_))
+    rendered_, learned = (features(one).astype(np.float64) for one in (own, mapped))
+    sight = Sight(features, shrunk(rendered_ - learned), told_by(features, seen, own))
     novelty = likeness_of(chain, chain.inputs(specimens), specimens, seen - mapped, 0)
     return replace(estimator, calibration=sight, novelty=novelty)
 
@@ -146,32 +144,6 @@ def _drawn(estimator: Estimator) -> list[dict[str, float]]:
     unknowns = rng.standard_normal((LIKE, len(prior.middle)))
     unknowns[:, :5] = low + (high - low) * rng.random((LIKE, 5))
     return [reachable(estimator.chain, prior.values(inside(prior, x))) for x in unknowns]
-
-
-def shrunk(errors: Floats) -> Floats:
-    """Return the second moments (k, k) of few errors (n, k), shrunk towards their diagonal, and that towards
-    its mean.
-
-    Both weights are those under which errors that are left out are likeliest; only the diagonal knows of
-    them. (Ledoit and Wolf 2004, [ledoit2004], weigh by the expected square instead, which forgives directions
-    that are taken for sure.)
-    """
-    n = len(errors)
-    moments = errors.T @ errors / n
-    own = np.diag(moments)
-    found: list[tuple[float, Floats]] = []
-    for a in _SHARES:
-        for b in _COMMON:
-            target = np.diag((1.0 - b) * own + b * own.mean())
-            # one error left out takes a rank from the moments (Sherman and Morrison 1950; [sherman1950])
-            root = linalg.cholesky((1.0 - a) * n / (n - 1) * moments + a * target, lower=True)
-            lost = (
-                (1.0 - a) / (n - 1) * (linalg.solve_triangular(root, errors.T, lower=True) ** 2).sum(axis=0)
-            )
-            square = (n - 1) / (1.0 - a) * lost / (1.0 - lost)
-            logs = 2.0 * np.log(np.diag(root)).sum() + np.log1p(-lost)
-            found.append((float((square + logs).sum()), (1.0 - a) * moments + a * target))
-    return np.asarray(min(found, key=lambda one: one[0])[1])
 
 
 def _read(task: Sample) -> tuple[Single, Single]:

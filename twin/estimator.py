@@ -16,8 +16,9 @@ from scenes.sensor import NotModelled
 from scenes.traced import TracedLight
 from twin import likeness
 from twin.chain import BLOCK, Chain, whole_blocks
+from twin.discrepancy import Discrepancy
 from twin.estimates import NAMES, Estimate
-from twin.fitting import Fitted, Near, Prior, fit, limits, reachable
+from twin.fitting import Fitted, Near, Prior, expected, fit, limits, reachable
 from twin.imagined import mean_variance
 from twin.put_back import put_back, where
 from twin.received import Received
@@ -38,12 +39,17 @@ class Sight:
     ----------
     features : of pictures.
     error : (k, k) second moments of what the chain's features are off by.
-    discrepancy : (k, k) of what rendered ones are off by, too (`twin.calibrate`).
+    discrepancy : what rendered ones are off by, too (`twin.calibrate`); nothing by default.
     """
 
     features: Features
     error: NDArray[np.float64]
-    discrepancy: NDArray[np.float64] | float = 0.0
+    discrepancy: Discrepancy | None = None
+
+    def off(self, pictures: NDArray[np.floating]) -> NDArray[np.float64] | float:
+        """Return second moments (k, k) of what features of pictures (levels, 2, ...) are off by when they are
+        rendered."""
+        return 0.0 if self.discrepancy is None else self.discrepancy.at(pictures)
 
     def only(self, blocks: NDArray[np.bool_]) -> Sight:
         """Return the same of some blocks (r, c) of each picture alone."""
@@ -167,7 +173,7 @@ class Estimator:
                 samples=samples,
                 seed=seed,
                 begin=begin,
-                always=sight.discrepancy,
+                always=sight.off(seen if blocks is None else seen[..., blocks]),
             )
         except (fem.NotModelled, NotModelled):
             return None
@@ -178,7 +184,8 @@ class Estimator:
         """Return what `refined` does of pictures of a camera that stands a little off, and these pictures put
         back; blocks that it has not seen are those that are expected."""
         sight = self.sight
-        parts = (self.chain, sight.features, sight.error + sight.discrepancy, self.coarse)
+        error = sight.error + sight.off(self.coarse(received))
+        parts = (self.chain, sight.features, error, self.coarse)
         matrix = where(*parts, self.prior.of_another_camera(self._pattern), received, start)
         now, blocks = put_back(received, matrix)
         back, prior = self.coarse(now), self.prior.of_another_camera(self._pattern, _LEFT_PERCENT)
@@ -202,15 +209,16 @@ class Estimator:
 
     def limits(self, values: Mapping[str, float], frames: float) -> tuple[NDArray[np.float64], float]:
         """Return the bound and the deflection at true values; see `fitting.limits`."""
-        sight = self.sight
-        return limits(self.chain, sight.features, self.prior, values, frames, sight.discrepancy)
+        sight, there = self.sight, self.prior.unknowns(values)
+        off = sight.off(expected(self.chain, self.prior, [there])[0])
+        return limits(self.chain, sight.features, self.prior, values, frames, off)
 
     def fitted(self, seen: Single, frames: float, start: NDArray[np.floating]) -> Fitted:
         """Return the most probable specimen by the chain, for coarse counts (levels, 2, r, c), from a start
         (5,)."""
         x = np.concatenate([start, np.zeros(self.prior.basis.shape[1])])
         sight = self.sight
-        told, error = sight.features(seen[None])[0], sight.error + sight.discrepancy
+        told, error = sight.features(seen[None])[0], sight.error + sight.off(seen)
         return fit(self.chain, sight.features, self.prior, told, frames, x, error)
 
 

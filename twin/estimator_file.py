@@ -29,6 +29,7 @@ from twin import likeness
 from twin.chain import Chain
 from twin.complaint import DesignError, shown
 from twin.design import parse_design
+from twin.discrepancy import Discrepancy
 from twin.estimator import Estimator, Sight
 from twin.fitting import Prior
 
@@ -77,7 +78,9 @@ def save_estimator(estimator: Estimator, emulator: bytes, path: str | Path) -> P
     arrays |= {"error": estimator.error}
     if (sight := estimator.calibration) is not None:
         arrays |= {f"sight.{name}": getattr(sight.features, name) for name in _FEATURES}
-        arrays |= {"sight.error": sight.error, "sight.discrepancy": np.asarray(sight.discrepancy)}
+        arrays |= {"sight.error": sight.error}
+        if sight.discrepancy is not None:
+            arrays |= {f"sight.{name}": value for name, value in vars(sight.discrepancy).items()}
     for number, one in enumerate(estimator.traced):
         arrays |= {f"traced.{number}.{name}": getattr(one, name) for name in traced.ARRAYS}
     arrays |= {f"novelty.{name}": np.asarray(value) for name, value in estimator.novelty.items()}
@@ -189,10 +192,10 @@ def _assembled(card: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Estimat
     sight = None
     if "sight.error" in arrays:
         own = _features(arrays, "sight", features.shape)
-        sight = Sight(own, arrays["sight.error"], arrays["sight.discrepancy"])
-        square = (len(own.spread),) * 2
-        if sight.error.shape != square or arrays["sight.discrepancy"].shape != square:
+        error, off = arrays["sight.error"], Discrepancy(arrays["sight.common"], arrays["sight.tared"])
+        if any(one.shape != (len(own.spread),) * 2 for one in (error, off.common, off.tared)):
             raise ValueError("shapes")
+        sight = Sight(own, error, off)
     prior = Prior(
         arrays["prior.ranges"],
         tuple(map(str, card["nuisances"])),

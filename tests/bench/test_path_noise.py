@@ -1,0 +1,63 @@
+"""What the noise of light paths costs: one standard picture beside the noise of one exposure.
+
+TWIN_MODEL=models/tsis pytest -m slow -s tests/bench/test_path_noise.py
+"""
+
+import os
+
+import numpy as np
+import pytest
+
+import twin
+from scenes import SpectralRenderer, backend
+from twin import presses, retake
+from twin.chain import BLOCK, seen_by, whole_blocks
+from twin.discrepancy import shrunk
+from twin.estimator_file import load_estimator
+from twin.fitting import covariance, expected, limits
+from twin.study import PARAMETERS
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.timeout(3600),
+    pytest.mark.skipif("TWIN_MODEL" not in os.environ, reason="needs TWIN_MODEL"),
+]
+SEEDS = 12
+BALL = dict(zip(PARAMETERS, (10.0, 5.0, 100.0, 0.0, 0.0), strict=True))
+
+
+def test_standard_lights_noise_is_far_above_an_exposures() -> None:
+    """Which is why a model that renders with learned light is off by more than its bound on such pictures."""
+    estimator = load_estimator(os.environ["TWIN_MODEL"])
+    chain, features, prior = estimator.chain, estimator.features, estimator.prior
+    backend.use("cpu")
+    values = {**prior.values(prior.middle), **BALL}
+    design, depths = seen_by(chain.design, values)
+    ball = twin.Inclusion(10.0, 5.0, 100.0)
+    renderer = SpectralRenderer(design.sensor(), count=design.light.bands, at=design.sensor, device="cpu")
+    found = presses.emulated(design, ball, depths, chain.emulator)
+
+    def counts(seed: int) -> np.ndarray:
+        def one(press: object, field: str) -> np.ndarray:
+            layers = renderer.render(press.surface, field=field, seed=seed).radiance  # type: ignore[attr-defined]
+            charge = retake.charge(design, layers, None, (1, 1)) / np.float32(design.camera.gain_e_per_dn)
+            return retake.average(whole_blocks(charge), BLOCK)
+
+        return np.array([[one(press, field) for field in ("pressure", "pressure_0")] for press in found])
+
+    many = np.stack([counts(seed) for seed in range(1, SEEDS + 1)])
+    middle = many.mean(axis=0)
+    noise = (many - middle) * np.float32(np.sqrt(SEEDS / (SEEDS - 1)))
+    # sensor and press are alike in their four quarters, so noise is as likely mirrored
+    mirrored = [noise[..., ::up, ::along] for up in (1, -1) for along in (1, -1)]
+    off = (features(middle + np.concatenate(mirrored)) - features(middle[None])).astype(np.float64)
+    plain = expected(chain, prior, [prior.unknowns(values)])[0]
+    exposure = covariance(chain, features, plain, chain.gain(values), 1.0)
+    ratio = np.sqrt((off**2).mean(axis=0) / np.diag(exposure))
+    print(
+        f"noise of paths over that of one exposure, of {len(ratio)} features: median {np.median(ratio):.0f}"
+    )
+    for name, error in (("one exposure alone", 0.0), ("and one standard picture's paths", shrunk(off))):
+        bound = np.sqrt(np.diag(limits(chain, features, prior, values, 1.0, error)[0])[:3])
+        print(f"bound, {name}: {bound[0]:.3f} mm, {bound[1]:.3f} mm, {bound[2]:.1f} kPa")
+    assert np.median(ratio) > 3.0
