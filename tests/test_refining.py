@@ -188,6 +188,32 @@ def test_quick_pictures_tell_the_same_valley(monkeypatch: pytest.MonkeyPatch) ->
     assert looks.count("quick") == 0
 
 
+def test_a_changed_brightness_is_no_inclusion(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rendered light answers the gain by more than the map's: quick pictures, which have no references, leave
+    the map's error as it was where the gain alone changes, for picture and reference alike."""
+
+    def pair(x: NDArray[np.float64], answer: float) -> NDArray[np.float32]:
+        signal = np.array([0.01 * x[0] ** 3, 0.0])
+        return np.asarray((1.0 + answer * x[5]) * (10.0 + signal), np.float32).reshape(1, 2, 1, 1)
+
+    def expected(chain: Any, prior: Prior, many: Any) -> NDArray[Any]:
+        return np.stack([pair(np.asarray(x), 0.02) for x in many])
+
+    def unknowns(values: Mapping[str, float]) -> NDArray[np.float64]:
+        return np.array([*(values[name] for name in PARAMETERS), values["gain"] / 0.02])
+
+    def whole(values: Mapping[str, float]) -> NDArray[np.float32]:
+        return pair(unknowns(values), 0.022)
+
+    monkeypatch.setattr(refining, "expected", expected)
+    at = np.array([8.0, 6.0, 80.0, 0.0, 0.0, 0.2])
+    off = refining._off(CHAIN, PRIOR, at, whole, lambda values: whole(values)[:, :1])
+    brighter, larger = at + np.array([0, 0, 0, 0, 0, 0.3]), at + np.array([0.5, 0, 0, 0, 0, 0])
+    assert np.allclose(off(brighter), off(at), atol=1e-6)
+    true = pair(larger, 0.022) - pair(larger, 0.02)
+    assert np.allclose(off(larger), true, atol=1e-6) and not np.allclose(true[:, 0], off(at)[:, 0], atol=1e-4)
+
+
 @pytest.mark.parametrize("modulus", [60.0, 95.0])
 def test_a_good_map_needs_no_rendering(modulus: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """Off by a tenth of the noise, and known to be: the posterior is that by rendering; off by more, it is
