@@ -249,6 +249,7 @@ def assembled(arrays: Mapping[str, NDArray[np.generic]], key: str, error_percent
     fits = (
         axes.shape == (len(centre), _INPUTS)
         and nodes.shape == (len(nodes), k)
+        and (np.abs(nodes).max(axis=0) > 0.0).all()
         and weights.shape == (1 + len(nodes), m)
         and mean.ndim == 4
         and mean.shape[-1] == mean.shape[-2]

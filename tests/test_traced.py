@@ -113,6 +113,7 @@ def test_hostile_files_are_refused(learned, tmp_path):
         {"centre": learned.centre * np.nan},
         {"nodes": learned.nodes[:, :1]},
         {"nodes": learned.nodes[1:]},
+        {"nodes": 0.0 * learned.nodes},
     ):
         traced.save([replace(learned, **change)], place)
         with pytest.raises(NotModelled, match="no traced light"):

@@ -18,7 +18,7 @@ from twin import likeness
 from twin.chain import BLOCK, Chain, whole_blocks
 from twin.discrepancy import Discrepancy
 from twin.estimates import NAMES, Estimate
-from twin.fitting import Fitted, Near, Prior, expected, fit, limits, reachable
+from twin.fitting import Fitted, Near, Prior, fit, limits, reachable
 from twin.imagined import mean_variance
 from twin.put_back import put_back, where
 from twin.received import Received
@@ -209,9 +209,8 @@ class Estimator:
 
     def limits(self, values: Mapping[str, float], frames: float) -> tuple[NDArray[np.float64], float]:
         """Return the bound and the deflection at true values; see `fitting.limits`."""
-        sight, there = self.sight, self.prior.unknowns(values)
-        off = sight.off(expected(self.chain, self.prior, [there])[0])
-        return limits(self.chain, sight.features, self.prior, values, frames, off)
+        sight = self.sight
+        return limits(self.chain, sight.features, self.prior, values, frames, sight.off)
 
     def fitted(self, seen: Single, frames: float, start: NDArray[np.floating]) -> Fitted:
         """Return the most probable specimen by the chain, for coarse counts (levels, 2, r, c), from a start

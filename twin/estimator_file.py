@@ -78,9 +78,9 @@ def save_estimator(estimator: Estimator, emulator: bytes, path: str | Path) -> P
     arrays |= {"error": estimator.error}
     if (sight := estimator.calibration) is not None:
         arrays |= {f"sight.{name}": getattr(sight.features, name) for name in _FEATURES}
+        assert sight.discrepancy is not None  # a calibration is made of one
         arrays |= {"sight.error": sight.error}
-        if sight.discrepancy is not None:
-            arrays |= {f"sight.{name}": value for name, value in vars(sight.discrepancy).items()}
+        arrays |= {f"sight.{name}": value for name, value in vars(sight.discrepancy).items()}
     for number, one in enumerate(estimator.traced):
         arrays |= {f"traced.{number}.{name}": getattr(one, name) for name in traced.ARRAYS}
     arrays |= {f"novelty.{name}": np.asarray(value) for name, value in estimator.novelty.items()}

@@ -7,7 +7,7 @@ probable values (Kay 1993, section 11.5; [kay1993]); derivatives are central dif
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -361,18 +361,19 @@ def limits(
     prior: Prior,
     values: Mapping[str, float],
     frames: float,
-    error: Floats | float = 0.0,
+    off: Callable[[NDArray[np.floating]], Floats | float] = lambda pictures: 0.0,
 ) -> tuple[Floats, float]:
     """Return the prior-included bound (5 + q, 5 + q) at true values, (J C⁻¹ Jᵀ + P)⁻¹, and the deflection d'
     with which an ideal observer tells the inclusion from none (see `estimation.detection`).
 
-    ``error`` is the covariance (k, k) of what pictures are off by, besides noise.
+    ``off`` tells the covariance (k, k) of what features of pictures (levels, 2, r, c) are off by, besides
+    noise.
 
     Raises `fem.NotModelled` where the chain cannot go.
     """
     x = prior.unknowns(values)
     seen, slopes = jacobian(chain, features, prior, x)
-    noise = covariance(chain, features, seen, chain.gain(prior.values(x)), frames) + error
+    noise = covariance(chain, features, seen, chain.gain(prior.values(x)), frames) + off(seen)
     told = slopes @ np.linalg.solve(noise, slopes.T)
     without = np.stack([seen[:, 1], seen[:, 1]], axis=1)
     signal = (features(seen[None])[0] - features(without[None])[0]).astype(np.float64)
