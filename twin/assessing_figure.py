@@ -34,7 +34,8 @@ def draw(
     axes[2].plot(ranges[2], ranges[2], color=GREY, lw=0.8)
     for (_, one), colour in zip(answered.items(), _COLOURS, strict=False):
         _bars(axes[2], one, 2, 0.0, colour)
-    axes[2].set(xlabel=f"true {_LABELS[2]}", ylabel=f"estimated {_LABELS[2]}", xlim=ranges[2], ylim=ranges[2])
+    wide = _wider(ranges[2])
+    axes[2].set(xlabel=f"true {_LABELS[2]}", ylabel=f"estimated {_LABELS[2]}", xlim=wide, ylim=wide)
     axes[0].legend(frameon=False, fontsize=8)
     _widths(axes[3], answered, ranges, tissue_kPa)
     _ratios(axes[4], answered)
@@ -58,7 +59,14 @@ def _errors(
     for one in answered.values():
         beyond += int((np.abs(one.answers.mean[:, number] - one.truth[:, number]) > reach).sum())
     title = f"{beyond} farther off are not shown" if beyond else ""
-    axis.set(xlabel=f"true {_LABELS[number]}", ylabel=label, xlim=span, ylim=(-reach, reach), title=title)
+    axis.set(xlabel=f"true {_LABELS[number]}", ylabel=label, title=title)
+    axis.set(xlim=_wider(span), ylim=(-reach, reach))
+
+
+def _wider(span: NDArray[np.float64]) -> tuple[float, float]:
+    """A range and a little more, so that what lies at its ends is seen."""
+    low, high = span
+    return low - 0.03 * (high - low), high + 0.03 * (high - low)
 
 
 def _bars(
