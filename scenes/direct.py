@@ -37,7 +37,7 @@ def relief(sensor: Sensor, deformed: OpticalSurface, cells: int = CELLS) -> Arra
     """Height (mm) and slopes along x and y of the deformed surface at the targets, (3, cells, cells)."""
     middles = _middles(sensor.guide.width_mm / 2, cells)
     height = heights(deformed, middles)
-    slope_y, slope_x = (np.gradient(height, middles, axis=axis) for axis in (0, 1))
+    slope_y, slope_x = (np.gradient(height, middles, axis=axis, edge_order=2) for axis in (0, 1))
     return np.stack([height, slope_x, slope_y])
 
 

@@ -78,6 +78,7 @@ class Faces:
     def __init__(self, scene: mi.Scene, sensor: Sensor) -> None:
         """Copy what is needed of the contact mesh onto records that are read at once."""
         self.scene = scene
+        self._half = dr.opaque(mi.Float, sensor.guide.width_mm / 2)
         shapes = {shape.id(): shape for shape in scene.shapes()}
         number = {
             name: int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])
@@ -119,6 +120,9 @@ class Faces:
         n = dr.select(on_mesh, dr.normalize(dr.cross(p1.xyz - p0.xyz, p2.xyz - p0.xyz)), flat)
         normal = dr.select(on_mesh, dr.normalize(u * n0 + v * n1 + w * n2), flat)
         p = dr.select(on_mesh, mi.Point3f(place.xyz), ray(found.t))
+        # the lip beyond the walls keeps light in; what shines on it from beside the guide passes the guide by
+        beside = dr.maximum(dr.abs(p.x), dr.abs(p.y)) > self._half
+        kind = dr.select(on_mesh & beside, mi.UInt32(NOTHING), kind)
         fraction = dr.select(on_mesh & dr.isfinite(place.w), place.w, 0.0)  # slivers at a pressed-back rim
         t, cosine = dr.select(valid, found.t, 0.0), -dr.dot(ray.d, normal)
         return Meeting(kind, found.shape, ray.d, t, p, n, normal, cosine, fraction)

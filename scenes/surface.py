@@ -138,11 +138,12 @@ def triangulate(surface: OpticalSurface) -> trimesh.Trimesh:
     """Deformed triangles, (n + 2)² vertices in row-major [iy, ix] order, normals towards the guide.
 
     The scene's side walls are flat, so what bulges beyond them (0.1 mm) is pressed back, and an outermost
-    ring closes the gap where the surface recedes.
+    ring closes the gap where the surface recedes. Both keep the normals of the surface as it is.
     """
     lines = surface.nodes_mm
     x, y = np.meshgrid(lines, lines)
     position = np.stack([x, y, surface.rest_mm], axis=-1) + surface.displacement_mm
+    normals = _normals(position)
     position = np.pad(position, ((1, 1), (1, 1), (0, 0)), mode="edge")
     # rising, so that no triangle degenerates: 0.1 µm is the least at which single precision still tells
     # where in a triangle a point lies
@@ -154,7 +155,17 @@ def triangulate(surface: OpticalSurface) -> trimesh.Trimesh:
         position[..., axis] = np.clip(position[..., axis], inward, outward)
         edge = np.moveaxis(position[..., axis], 1 - axis, 0)
         edge[0], edge[-1] = -limit[-1], limit[-1]
-    return trimesh.Trimesh(position.reshape(-1, 3), _faces(lines.size + 2), process=False)
+    return trimesh.Trimesh(
+        position.reshape(-1, 3), _faces(lines.size + 2), vertex_normals=normals, process=False
+    )
+
+
+def _normals(position: Array) -> Array:
+    """Unit normals towards the guide of a grid of points (n, n, 3), with the skirt's ring: ((n + 2)², 3)."""
+    along_y, along_x = np.gradient(position, axis=(0, 1), edge_order=2)
+    normals = np.cross(along_y, along_x)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    return np.asarray(np.pad(normals, ((1, 1), (1, 1), (0, 0)), mode="edge").reshape(-1, 3))
 
 
 def with_skirt(values: Array) -> Array:

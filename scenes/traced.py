@@ -35,7 +35,7 @@ _COARSE = 50  # cells per side on which modes are kept
 _FINE = 100  # on which their mean is
 _BEYOND = 2.0  # how far inputs may leave what was learned, times its reach
 FORMAT = "tsis-traced-3"
-LIGHT = 7
+LIGHT = 8
 """Counts up when pictures of the same press change: what was learned or kept before is of no use then."""
 BIAS_SINCE = 5
 """The first light of which a quality's measured bias holds: what changed since is common to all qualities, or

@@ -218,8 +218,8 @@ def transport(
         newest = under.again(even(maps[:, :plain]))
         total, landed, fallen = total + newest, landed + maps, fallen + fell
         ratio = newest[:, 0].sum(axis=(1, 2)) / np.maximum(before, 1e-300)
-    # each order is like the one before by now: the rest is a geometric series
-    ratio = np.clip(ratio, 0.0, 0.9)
+    # each order is like the one before by now: the rest is a geometric series, or nothing behind black tissue
+    ratio = np.clip(ratio, 0.0, 0.9) * (newest[:, 0].sum(axis=(1, 2)) > 0.0)
     rest = (ratio / (1.0 - ratio))[:, None, None, None]
     fallen = fallen + fell * rest.reshape(n_led, *(fell.ndim - 1) * (1,))
     return Light(total + newest * rest, sinks, trapped, landed + maps * rest.astype(np.float32), fallen)

@@ -148,7 +148,7 @@ class Relief:
     def on(height: NDArray[np.float64], width_mm: float) -> Relief:
         """From heights at the middles of cells [iy, ix], (m, m) mm."""
         middles = (np.arange(len(height)) + 0.5) / len(height) * width_mm - width_mm / 2
-        slope_y, slope_x = np.gradient(height, middles, middles)
+        slope_y, slope_x = np.gradient(height, middles, middles, edge_order=2)
         stacked = np.stack([height, slope_x, slope_y], axis=-1).astype(np.float32)
         maps = mi.Texture2f(mi.TensorXf(stacked), wrap_mode=dr.WrapMode.Clamp)
         return Relief(maps, width_mm, float(middles[-1]))

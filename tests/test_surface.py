@@ -172,6 +172,18 @@ def test_vertex_normals_are_unit_vectors_towards_the_guide(name: str) -> None:
     assert np.all(normals[:, 2] < 0.0)
 
 
+def test_vertex_normals_are_those_of_the_surface_up_to_the_rim() -> None:
+    """Of a paraboloid in closed form; where it is pressed back against a wall, as where it is not."""
+    for bulge in (0.0, 0.1, -0.1):
+        mesh = triangulate(shaped(lambda x, y, b=bulge: (b * x / HALF_MM, 0.0, -(x**2 + y**2) / 300.0)))
+        line = np.pad(np.linspace(-HALF_MM, HALF_MM, 193), 1, mode="edge")
+        x, y = (v.ravel() for v in np.meshgrid(line, line))
+        slopes = x / 150.0 / (1.0 + bulge / HALF_MM), y / 150.0
+        expected = np.column_stack([-slopes[0], -slopes[1], -np.ones_like(x)])
+        expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+        np.testing.assert_allclose(mesh.vertex_normals, expected, rtol=0, atol=1e-6)
+
+
 def test_values_on_vertices_follow_the_vertices() -> None:
     surface = shaped(lambda x, y: (0.0, 0.0, 0.0), pressure=lambda x, y: 1.0 + 0.02 * x + 0.03 * y)
     vertices = np.clip(triangulate(surface).vertices, -HALF_MM, HALF_MM)
