@@ -4,7 +4,11 @@ Under a face that bulges into it there is more tissue for each area of the face 
 1 + H z with H the sum of both curvatures (Weyl 1939; key weyl1939). Diffuse light that falls as exp(-λ z)
 under a flat face then falls as exp(-(λ + H/2) z), to first order: φ'' + H φ' - λ² φ = 0. Its decay also grows
 with the lateral wave number, λ² = λ0² + k² (`slab`), so that the flat reflectance tells what a faster decay
-costs: d ln R / dλ = (λ/k) d ln R / dk. Light that the face throws back comes again: R / (1 - w R) for R.
+costs: d ln R / dλ = (λ/k) d ln R / dk. Light that the face throws back comes again: G = R / (1 - w R) for R.
+
+That is the change of all the light that one spot gives back, and by reciprocity of what comes back there of
+light all over. Half of it is due where light goes in and half where it comes out: a factor 1 + γ at either
+end, with γ (1 + G / G(0)) that change.
 
 All else of standard light has tissue flat; the reference (`wander`) walks under the surface as it is.
 """
@@ -43,14 +47,19 @@ class Bent:
     cell_mm: float
 
     def on(self, height_mm: Array, thrown: float) -> Array:
-        """Light given back over that under a flat face, (m, m), where the face is at heights [iy, ix] (m, m),
-        mm, and throws back such a share of what comes up under it."""
+        """Factor, over a flat face, of light that goes in and again of light that comes out, (m, m), where
+        the face is at heights [iy, ix] (m, m), mm, and throws back such a share of what comes up under it.
+
+        What comes back there of light all over is f + G * (f - 1) / G(0) times as much, f² where it is even.
+        """
         padded, (rows, columns) = len(self.answer), height_mm.shape
         bends = np.zeros(height_mm.shape)
         bends[1:-1] -= np.diff(height_mm, 2, axis=0)
         bends[:, 1:-1] -= np.diff(height_mm, 2, axis=1)
         spectrum = scipy.fft.rfft2(bends / self.cell_mm**2, (padded, padded), workers=1)
-        spectrum *= self.answer / (1.0 - thrown * self.reflectance)
+        again = 1.0 / (1.0 - thrown * self.reflectance)
+        given = self.reflectance * again
+        spectrum *= self.answer * again / (1.0 + given / given[0, 0])
         found = scipy.fft.irfft2(spectrum, (padded, padded), workers=1)[:rows, :columns]
         return np.asarray(1.0 + 0.5 * found)
 

@@ -152,7 +152,8 @@ class Response:
         inside = self.under.inside
 
         def one(number: int) -> Array:
-            return self._solved(self._entering(landed, number, self._modes), 1e-3)[..., inside, inside]
+            entering = self._entering(landed, number, self._modes)
+            return self._solved(entering, 1e-3)[..., inside, inside] * self.under.bends
 
         return np.stack(abreast(one, len(landed.light)), axis=1)
 
@@ -163,14 +164,15 @@ class Response:
         def one(number: int) -> Array:
             entering = self._entering(landed, number)
             straight = self._passage.enter(entering, glimpse=False)[0]
-            return self._solved(entering[:, : self._modes], 1e-3, straight)[..., inside, inside]
+            found = self._solved(entering[:, : self._modes], 1e-3, straight)
+            return found[..., inside, inside] * self.under.bends
 
         return np.stack(abreast(one, len(landed.light)), axis=1)
 
     def seen(self, landed: Landed) -> list[Seen]:
         """`Under.seen`, and its derivatives to each parameter."""
         found = abreast(lambda number: self._seen(landed, number), len(landed.light))
-        return [Seen.of(parts) for parts in zip(*found, strict=True)]
+        return [self.under.bend(Seen.of(parts)) for parts in zip(*found, strict=True)]
 
     def _seen(self, landed: Landed, number: int) -> list[Seen]:
         """The same of one LED."""

@@ -39,7 +39,7 @@ LIGHT = 8
 """Counts up when pictures of the same press change: what was learned or kept before is of no use then."""
 BIAS_SINCE = 5
 """The first light of which a quality's measured bias holds: what changed since is common to all qualities, or
-less than the bias is known to (LIGHT 7: 0.11 % in a blob, 0.09 % in a background)."""
+less than the bias is known to (LIGHT 7, 8: 0.11 % in a blob, 0.09 % in a background)."""
 ARRAYS = ("centre", "axes", "nodes", "weights", "mean", "modes")
 """Fields of `TracedLight` that are arrays."""
 

@@ -256,7 +256,8 @@ class Under:
     ground: Ground
     bed: Bed
     face: Face
-    counts: Singles  # share of a cell's light that comes to the surface, and how that answers light: (m, m)
+    counts: Singles  # share of a cell's light that goes in where the surface is, bent as it is: (m, m)
+    bends: Singles  # factor of what comes out of it (`bent`), (m, m)
 
     @staticmethod
     def at(basis: AngularBasis, behind: Behind, ground: Ground) -> Under:
@@ -264,8 +265,8 @@ class Under:
         entrance, face = Entrance.at(basis, ground.fraction), behind.passage.face(fraction)
         bed, inside = behind.spread.on(fraction), slice(behind.passage.margin, -behind.passage.margin)
         thrown = behind.spread.free + float(bed.excess[inside, inside].mean())
-        counts = (ground.meets * behind.bent.on(ground.height_mm, thrown)).astype(np.float32)
-        return Under(entrance, behind, ground, bed, face, counts)
+        bends = behind.bent.on(ground.height_mm, thrown).astype(np.float32)
+        return Under(entrance, behind, ground, bed, face, ground.meets * bends, bends)
 
     @cached_property
     def coarser(self) -> Under:
@@ -284,7 +285,7 @@ class Under:
 
         def one(number: int) -> Array:
             some = landed[number : number + 1] * self.counts
-            return self._upward(transmitted(self.entrance, some, self._modes), 1e-3)[0]
+            return self._upward(transmitted(self.entrance, some, self._modes), 1e-3)[0] * self.bends
 
         return np.concatenate(abreast(one, len(landed)))
 
@@ -294,7 +295,7 @@ class Under:
         def one(number: int) -> Array:
             entering = transmitted(self.entrance, landed[number : number + 1] * self.counts)
             straight = self.behind.passage.enter(entering, glimpse=False)[0]
-            return self._upward(entering[:, : self._modes], 1e-3, straight)[0]
+            return self._upward(entering[:, : self._modes], 1e-3, straight)[0] * self.bends
 
         return np.concatenate(abreast(one, len(landed)))
 
@@ -318,7 +319,12 @@ class Under:
             last = passage.last_thrown_back(more, self.face)
             return passage.towards_camera(glimpse, again, last)
 
-        return Seen.of(abreast(one, len(landed)))
+        return self.bend(Seen.of(abreast(one, len(landed))))
+
+    def bend(self, seen: Seen) -> Seen:
+        """Light under a flat face as it leaves this one, in place."""
+        seen.maps[..., self.inside, self.inside] *= self.bends
+        return seen
 
     def glanced(self, upward: Array) -> Seen:
         """About what goes to the camera of all LEDs together, from `Light.upward`: enough to tell noise."""
