@@ -77,3 +77,18 @@ def domed() -> OpticalSurface:
     displacement = np.stack([0.0 * rest, 0.0 * rest, -0.05 - 0.02 * rise], axis=-1)
     pressure = 0.9 * (1.0 + 0.6 * rise) * np.clip(1.0 - square / 200.0, 0.0, None) ** 0.5
     return OpticalSurface(line, displacement, pressure, rest)
+
+
+@cache
+def contact_table(albedo: float = ALBEDO) -> ContactOptics:
+    return contact_optics(1.4336, 1.0, 1.40, albedo, 10.0, 550.0)
+
+
+def contact_bsdf(fraction: float, albedo: float = ALBEDO) -> dict[str, Any]:
+    from scenes.bsdf import Table
+
+    return {
+        "type": "frustrated_tir",
+        "table": Table.pack(contact_table(albedo)),
+        "contact_fraction": {"type": "uniform", "value": fraction},
+    }

@@ -7,6 +7,7 @@ that light enters once.
 from __future__ import annotations
 
 import dataclasses
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -43,7 +44,7 @@ def test_what_enters_is_the_references(
     ours, theirs = _gathered(renderer, shape, max(passes // 4, 3)), _followed(renderer, passes, monkeypatch)
     line = np.abs((np.arange(CELLS) + 0.5) / CELLS - 0.5) * sensor.guide.width_mm
     place = np.maximum(line, line[:, None])
-    for low, high in zip(EDGES[:-1], EDGES[1:], strict=True):
+    for low, high in pairwise(EDGES):
         band = (place >= low) & (place < high)
         (mean, error), (expected, noise) = (_mean(maps[:, band].mean(axis=1)) for maps in (ours, theirs))
         off, sure = 100 * (mean / expected - 1), 100 * np.hypot(error, noise) / expected
@@ -92,7 +93,8 @@ def _followed(renderer: Any, passes: int, monkeypatch: pytest.MonkeyPatch) -> np
         column, row = (
             mi.UInt32(dr.clip((at / width + 0.5) * CELLS, 0, CELLS - 1)) for at in (met.p.x, met.p.y)
         )
-        dr.scatter_add(counted, mi.Int64(dr.round(throughput * weight(met.cosine) * unit)), row * CELLS + column, enters)
+        amount = mi.Int64(dr.round(throughput * weight(met.cosine) * unit))
+        dr.scatter_add(counted, amount, row * CELLS + column, enters)
         return mi.Ray3f(met.p, met.d), mi.Float(0.0), random, scores
 
     monkeypatch.setattr(exact.wander, "wander", end)
