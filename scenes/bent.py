@@ -4,11 +4,15 @@ Under a face that bulges into it there is more tissue for each area of the face 
 1 + H z with H the sum of both curvatures (Weyl 1939; key weyl1939). Diffuse light that falls as exp(-λ z)
 under a flat face then falls as exp(-(λ + H/2) z), to first order: φ'' + H φ' - λ² φ = 0. Its decay also grows
 with the lateral wave number, λ² = λ0² + k² (`slab`), so that the flat reflectance tells what a faster decay
-costs: d ln R / dλ = (λ/k) d ln R / dk. Light that the face throws back comes again: G = R / (1 - w R) for R.
+costs: d ln R / dλ = (λ/k) d ln R / dk. Light that the face throws back comes again: R / (1 - w R) for R.
 
-That is the change of all the light that one spot gives back, and by reciprocity of what comes back there of
-light all over. Half of it is due where light goes in and half where it comes out: a factor 1 + γ at either
-end, with γ (1 + G / G(0)) that change.
+Curvature that changes from place to place tells less: a crest is also where light has not yet spread out. By
+walks under waves it tells half at a wave number k½ with k½² = 0.06 + 0.45 λ0², per transport mean free path,
+and nothing at 1.6 times that (`tests/test_bent.py`); a Gaussian stands for it.
+
+All this is the change of all the light that one spot gives back, and by reciprocity of what comes back there
+of light all over. Half of it is due where light goes in and half where it comes out: a factor 1 + γ at either
+end, with γ (1 + G / G(0)) that change, G the reflectance with what is thrown back.
 
 All else of standard light has tissue flat; the reference (`wander`) walks under the surface as it is.
 """
@@ -28,6 +32,7 @@ Array = NDArray[np.float64]
 
 _NODES = 160  # wave numbers at which the flat reflectance is worked out
 _LEAST, _MOST = 1e-3, 1e3  # of them, per transport mean free path
+_EVEN = np.array([0.045, 0.055])  # wave numbers that stand for even curvature
 
 
 @dataclass(frozen=True)
@@ -37,7 +42,7 @@ class Bent:
     Attributes
     ----------
     reflectance, answer : (p, p // 2 + 1)
-        R and d ln R / dλ, mm, at the wave numbers of maps padded to p cells.
+        R, and d ln R / dλ as far as curvature tells, mm, at the wave numbers of maps padded to p cells.
     cell_mm
         Side of a cell.
     """
@@ -72,7 +77,8 @@ def bent(tissue: TissueOptics, width_mm: float, cells: int) -> Bent:
     wave = np.clip(np.hypot(kx, ky[:, None]) / per_mm, _LEAST, _MOST)
     nodes = np.geomspace(_LEAST, _MOST, _NODES)
     flat = np.maximum(tissue.slab.reflectance(nodes), 1e-12)
-    steep = np.gradient(np.log(flat), np.log(nodes)) / nodes  # d ln R / dk
-    steep *= np.hypot(decay_rate(tissue.slab.albedo), nodes) / nodes
-    at = np.log(wave)
-    return Bent(np.interp(at, np.log(nodes), flat), np.interp(at, np.log(nodes), steep) / per_mm, cell)
+    decay, mean = decay_rate(tissue.slab.albedo), float(_EVEN.mean())
+    low, high = np.log(np.maximum(tissue.slab.reflectance(_EVEN), 1e-12))
+    even = (high - low) / float(np.ptp(_EVEN)) * np.hypot(decay, mean) / mean / per_mm
+    answer = even * 0.5 ** (wave**2 / (0.06 + 0.45 * decay**2))
+    return Bent(np.interp(np.log(wave), np.log(nodes), flat), answer, cell)
