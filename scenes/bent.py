@@ -41,8 +41,8 @@ class Bent:
 
     Attributes
     ----------
-    reflectance, answer : (p, p // 2 + 1)
-        R, and d ln R / dλ as far as curvature tells, mm, at the wave numbers of maps padded to p cells.
+    reflectance, answer : (m, m)
+        R, and d ln R / dλ as far as curvature tells, mm, at the wave numbers of cosines over the face.
     cell_mm
         Side of a cell.
     """
@@ -57,24 +57,22 @@ class Bent:
 
         What comes back there of light all over is f + G * (f - 1) / G(0) times as much, f² where it is even.
         """
-        padded, (rows, columns) = len(self.answer), height_mm.shape
         bends = np.zeros(height_mm.shape)
         bends[1:-1] -= np.diff(height_mm, 2, axis=0)
         bends[:, 1:-1] -= np.diff(height_mm, 2, axis=1)
-        spectrum = scipy.fft.rfft2(bends / self.cell_mm**2, (padded, padded), workers=1)
+        # what is seen of the rim comes from this side of it: the other is taken to be its mirror image
+        spectrum = scipy.fft.dctn(np.pad(bends[1:-1, 1:-1], 1, mode="edge") / self.cell_mm**2, workers=1)
         again = 1.0 / (1.0 - thrown * self.reflectance)
         given = self.reflectance * again
         spectrum *= self.answer * again / (1.0 + given / given[0, 0])
-        found = scipy.fft.irfft2(spectrum, (padded, padded), workers=1)[:rows, :columns]
-        return np.asarray(1.0 + 0.5 * found)
+        return np.asarray(1.0 + 0.5 * scipy.fft.idctn(spectrum, workers=1))
 
 
 def bent(tissue: TissueOptics, width_mm: float, cells: int) -> Bent:
     """Prepare the answer on `cells` x `cells` cells over a face of `width_mm`."""
-    padded, cell = int(scipy.fft.next_fast_len(2 * cells, real=True)), width_mm / cells
-    per_mm = tissue.transport_per_mm
-    kx, ky = (2.0 * np.pi * waves(padded, cell) for waves in (scipy.fft.rfftfreq, scipy.fft.fftfreq))
-    wave = np.clip(np.hypot(kx, ky[:, None]) / per_mm, _LEAST, _MOST)
+    per_mm, cell = tissue.transport_per_mm, width_mm / cells
+    line = np.pi / width_mm * np.arange(cells)
+    wave = np.clip(np.hypot(line, line[:, None]) / per_mm, _LEAST, _MOST)
     nodes = np.geomspace(_LEAST, _MOST, _NODES)
     flat = np.maximum(tissue.slab.reflectance(nodes), 1e-12)
     decay, mean = decay_rate(tissue.slab.albedo), float(_EVEN.mean())
