@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from sensors import bump, domed, paper_sensor
 
-from scenes.skin import Tissue
+from scenes.skin import Sheet, Tissue
 
 CELLS = 200
 DARK = Tissue(scattering_per_mm=0.01, absorption_per_mm=10.0)
@@ -50,6 +50,25 @@ def test_what_enters_is_the_references(
         off, sure = 100 * (mean / expected - 1), 100 * np.hypot(error, noise) / expected
         print(f"{coupling}, {'domed' if curved else 'flat'}, {low:g} to {high:g}: {off:+.2f} ± {sure:.2f} %")
         assert abs(off) < 0.3 + 3.5 * sure
+
+
+def test_behind_a_black_sheet_light_is_counted_once(variant: str) -> None:
+    """What the maps say enters is what the walks' balance says: nothing comes back to go on."""
+    from scenes import Renderer, build, direct, surface, transport
+    from scenes.irradiance import transmitted
+    from scenes.trace import SINKS
+
+    base = paper_sensor("air")
+    sheet = Sheet(thickness_mm=0.5, modulus_kPa=100.0, scattering_per_mm=0.0, absorption_per_mm=5.0)
+    sensor = dataclasses.replace(base, skin=dataclasses.replace(base.skin, sheet=sheet))
+    renderer, shape = Renderer(sensor, "cpu"), surface.resample(bump(), sensor.guide.width_mm)
+    build.put_surface(renderer.scene, sensor, shape)
+    under = transport.Under.at(renderer.basis, renderer.behind, transport.survey(renderer.scene, sensor))
+    straight = direct.direct(sensor, renderer.basis, shape)
+    light = transport.transport(renderer.scene, sensor, renderer.table, under, straight, 2**17, 1)
+    entered = transmitted(under.entrance, straight + light.traced, 1).sum()
+    entered *= (sensor.guide.width_mm / CELLS) ** 2
+    assert entered == pytest.approx(light.sinks[:, SINKS.index("tissue")].sum(), rel=0.02)
 
 
 def _mean(values: np.ndarray) -> tuple[float, float]:
