@@ -69,8 +69,8 @@ def bump() -> pv.PolyData:
 
 
 def domed() -> OpticalSurface:
-    """The same on a dome of 150 mm radius, which tissue follows and leaves at the corners, as finite elements
-    have a press of 1 mm: curved by 1/200 to 1/110 mm, without a fold."""
+    """The same on a dome of 150 mm radius, which tissue follows and leaves at the corners: 1/150 mm curved.
+    Finite elements have a press of 1 mm curved by 1/220 in the middle to 1/110 mm, without a fold."""
     line = np.linspace(-HALF_MM, HALF_MM, NODES)
     square = line**2 + line[:, None] ** 2
     rest, rise = -square / 300.0, np.exp(-square / 32.0)

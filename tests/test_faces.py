@@ -72,6 +72,23 @@ def test_every_ray_meets_the_face_that_mitsuba_meets(met: dict[str, Any]) -> Non
         assert (here & valid).any(), name
 
 
+def test_light_from_beside_the_guide_passes_the_lip_by(variant: str) -> None:
+    """Straight up 1 µm beside the wall Mitsuba meets the contact mesh, and 1 µm before it both do."""
+    import mitsuba as mi
+
+    from scenes import Renderer, build, faces, surface
+
+    sensor = paper_sensor("air")
+    scene = Renderer(sensor, "cpu").scene
+    build.put_surface(scene, sensor, surface.resample(bump(), sensor.guide.width_mm))
+    x = mi.Float([HALF_MM + 1e-3, -HALF_MM - 1e-3, HALF_MM - 1e-3, 1e-3 - HALF_MM])
+    ray = mi.Ray3f(mi.Point3f(x, 1.3, -1.0), mi.Vector3f(0.0, 0.0, 1.0))
+    stock, ours = scene.ray_intersect(ray), faces.Faces(scene, sensor).meet(ray, mi.Bool(True))
+    contact = next(shape for shape in scene.shapes() if shape.id() == "contact")
+    assert np.array(stock.is_valid() & (stock.shape == mi.ShapePtr(contact))).all()
+    assert np.array(ours.kind).tolist() == [faces.NOTHING] * 2 + [faces.CONTACT] * 2
+
+
 def test_points_normals_and_contact_fraction_are_mitsubas(met: dict[str, Any]) -> None:
     there = met["valid"] & ~met["discs"]  # an LED's normal is not needed: light ends there
     for ours, stock, limit in zip(met["ours"], met["stock"], (3e-5, 1e-6, 1e-6, 1e-6, 0.0), strict=True):
