@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -16,10 +16,16 @@ from . import backend, surface, view
 from .sensor import NotModelled, Sensor
 
 if TYPE_CHECKING:
+    import mitsuba as mi
     import pyvista as pv
 
+    from .bsdf import Table
     from .gather import Sight
+    from .irradiance import AngularBasis
     from .traced import TracedLight
+    from .transport import Behind
+
+    _Tables = tuple[Behind, AngularBasis, mi.TensorXf, Table]
 
 Array = NDArray[np.float64]
 Quality = Literal["preview", "standard", "reference"]
@@ -93,29 +99,26 @@ class Rendering:
 class Renderer:
     """A sensor's scene, built once; each `render` moves its contact surface in place."""
 
-    def __init__(self, sensor: Sensor, device: str = "auto", *, coloured: bool = False) -> None:
+    def __init__(
+        self, sensor: Sensor, device: str = "auto", *, coloured: bool = False, like: Renderer | None = None
+    ) -> None:
         """Load the scene on `device` ("auto", "cpu" or "cuda"; see `backend.use`).
 
         With `coloured` the sensor may have an `inclusion` of other colour, whose `place` every picture is
-        then told; without, it is refused, so that no picture leaves it out unnoticed.
+        then told; without, it is refused, so that no picture leaves it out unnoticed. What is behind the
+        contact is taken from a renderer ``like`` this one, where that is the same.
         """
         if sensor.inclusion is not None and not coloured:
             raise NotModelled(COLOUR)
         backend.use(device)
         # only now: Mitsuba's classes bind to the variant that is active when they are defined
-        from . import build, transport
-        from .bsdf import Table
-        from .irradiance import angular_basis
+        from . import build
 
         self.sensor = sensor
         self.rays = view.pixel_rays(sensor)
-        with threadpool_limits(1):  # linear algebra on several threads sums in another order
-            optics = build.optics_of(sensor)
-            coupling = build.coupling_of(sensor, optics)
-            self.behind = transport.Behind.of(sensor, coupling)
-            self.basis = angular_basis(optics, coupling)
-        self.packed = Table.pack(optics, coupling)
-        self.table = Table(self.packed)
+        same = like is not None and _contact(like.sensor) == _contact(sensor)
+        self.tables: _Tables = like.tables if like is not None and same else _tables(sensor)
+        self.behind, self.basis, self.packed, self.table = self.tables
         self.scene = build.load_scene(sensor, self.packed)
 
     @backend.flushing()
@@ -313,6 +316,26 @@ class Renderer:
             fallen = tally.collected() * (flux / samples / count)[:, None, None, None]
             share = self._add_housing(picture, sight, fallen)
         return _Found(picture, noise, share)
+
+
+def _tables(sensor: Sensor) -> _Tables:
+    """What is behind the contact, how it depends on angles, the contact's optics, the same on the device."""
+    from . import build, transport
+    from .bsdf import Table
+    from .irradiance import angular_basis
+
+    with threadpool_limits(1):  # linear algebra on several threads sums in another order
+        optics = build.optics_of(sensor)
+        coupling = build.coupling_of(sensor, optics)
+        behind = transport.Behind.of(sensor, coupling)
+        basis = angular_basis(optics, coupling)
+    packed = Table.pack(optics, coupling)
+    return behind, basis, packed, Table(packed)
+
+
+def _contact(sensor: Sensor) -> tuple[object, ...]:
+    """All that decides what is behind the contact and how light enters: not how much of it is real."""
+    return sensor.guide, replace(sensor.skin, rms_slope=1.0, kappa=1.0), sensor.tissue, sensor.wavelength_nm
 
 
 def passes(samples: int, n_led: int) -> tuple[int, int]:

@@ -37,6 +37,7 @@ class SpectralRenderer:
         at: Callable[[float], Sensor] | None = None,
         device: str = "auto",
         coloured: bool = False,
+        like: SpectralRenderer | None = None,
     ) -> None:
         """Load the scenes on `device` ("auto", "cpu" or "cuda"; see `backend.use`).
 
@@ -48,13 +49,19 @@ class SpectralRenderer:
             Number of bands of a spectrum that is no line.
         at
             The sensor at another wavelength, nm; without it the indices stay the same.
-        coloured
+        coloured, like
             As of `Renderer`.
         """
         self.sensor, self._device = sensor, device
         parts = band_sensors(sensor, count=count, at=at)
         self.bands, self._leds = [band for band, _, _ in parts], [leds for _, leds, _ in parts]
-        self.renderers = [Renderer(one, device=device, coloured=coloured) for _, _, one in parts]
+        others: list[Renderer | None] = [None] * len(parts)
+        if like is not None and len(like.renderers) == len(parts):
+            others = list(like.renderers)
+        self.renderers: list[Renderer] = [
+            Renderer(one, device=device, coloured=coloured, like=other)
+            for (_, _, one), other in zip(parts, others, strict=True)
+        ]
 
     @cached_property
     def whole(self) -> Renderer:

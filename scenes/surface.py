@@ -183,9 +183,18 @@ def _faces(n: int) -> NDArray[np.int64]:
 def at(
     surface: OpticalSurface, position_mm: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Pressure, kPa, and displacement along z, mm, at deformed positions (..., 2) mm; shape (...)."""
+    """Pressure, kPa, and displacement along z, mm, at deformed positions (..., 2) mm; shape (...).
+
+    Positions are many and shifts smooth: where points come from is found on the grid, and looked up.
+    """
+    line = surface.nodes_mm
+    x, y = np.meshgrid(line, line)
+    grid = np.stack([x, y], axis=-1)
+    shift = grid - _undeformed(surface, grid)
+    target = np.asarray(position_mm, dtype=np.float64)
+    undeformed = target - _look_up(line, np.moveaxis(shift, -1, 0), target, -1)
     fields = np.stack([surface.pressure_kPa, surface.displacement_mm[..., 2]])
-    pressure, displacement_z = _at(surface, fields, np.asarray(position_mm, dtype=np.float64))
+    pressure, displacement_z = _look_up(line, fields, undeformed)
     return pressure.astype(np.float32), displacement_z.astype(np.float32)
 
 
@@ -194,24 +203,21 @@ def heights(surface: OpticalSurface, line_mm: Array) -> Array:
     (m,)."""
     x, y = np.meshgrid(line_mm, line_mm)
     fields = (surface.rest_mm + surface.displacement_mm[..., 2])[None]
-    return np.asarray(_at(surface, fields, np.stack([x, y], axis=-1))[0])
+    undeformed = _undeformed(surface, np.stack([x, y], axis=-1))
+    return np.asarray(_look_up(surface.nodes_mm, fields, undeformed)[0])
 
 
-def _at(surface: OpticalSurface, fields: Array, target: Array) -> Array:
-    """Fields (k, n, n) at deformed positions (..., 2) mm, (k, ...).
-
-    The undeformed point of each position is found by fixed-point iteration, which contracts by the strain (a
-    few per cent).
-    """
-    line = surface.nodes_mm
-    step = line[1] - line[0]
-
-    def look_up(values: Array, points: Array) -> Array:
-        index = (points[..., ::-1] - line[0]) / step
-        return np.asarray(map_coordinates(values, np.moveaxis(index, -1, 0), order=1, mode="nearest"))
-
+def _undeformed(surface: OpticalSurface, target: Array) -> Array:
+    """Undeformed points (..., 2) of deformed positions (..., 2) mm, by fixed-point iteration, which contracts
+    by the strain (a few per cent)."""
+    across = np.moveaxis(surface.displacement_mm[..., :2], -1, 0)
     undeformed = target
     for _ in range(4):
-        shift = np.stack([look_up(surface.displacement_mm[..., i], undeformed) for i in (0, 1)], axis=-1)
-        undeformed = target - shift
-    return np.stack([look_up(values, undeformed) for values in fields])
+        undeformed = target - _look_up(surface.nodes_mm, across, undeformed, -1)
+    return undeformed
+
+
+def _look_up(line: Array, fields: Array, points: Array, axis: int = 0) -> Array:
+    """Fields (k, n, n) on the grid of `line` (n,), bilinear, at points (..., 2); k along `axis`."""
+    index = np.moveaxis((points[..., ::-1] - line[0]) / (line[1] - line[0]), -1, 0)
+    return np.stack([map_coordinates(values, index, order=1, mode="nearest") for values in fields], axis=axis)

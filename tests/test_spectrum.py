@@ -174,6 +174,24 @@ def test_line_renders_the_same_bytes_as_one_renderer(variant: str) -> None:
     assert spectral.render(bump(), **options).radiance.tobytes() == one.radiance.tobytes()  # type: ignore[arg-type]
 
 
+def test_a_renderer_like_another_takes_only_what_is_the_same(variant: str) -> None:
+    """Of other contact and light, the tables; of other tissue, none; and the same bytes as one of its own."""
+    from scenes import SpectralRenderer
+
+    sensor = paper_sensor(columns=96, rows=64, pixel_um=(67.0, 75.0))
+    skin = dataclasses.replace(sensor.skin, rms_slope=1.3 * sensor.skin.rms_slope)
+    leds = tuple(dataclasses.replace(led, flux_W=2.0 * led.flux_W) for led in sensor.leds)
+    first, other = SpectralRenderer(sensor, device="cpu"), dataclasses.replace(sensor, skin=skin, leds=leds)
+    like = SpectralRenderer(other, device="cpu", like=first)
+    assert like.renderers[0].behind is first.renderers[0].behind
+    options = {"quality": "preview", "samples": 2**14, "seed": 5}
+    own = SpectralRenderer(other, device="cpu").render(bump(), **options).radiance  # type: ignore[arg-type]
+    assert like.render(bump(), **options).radiance.tobytes() == own.tobytes()  # type: ignore[arg-type]
+    paler = dataclasses.replace(sensor.tissue, absorption_per_mm=0.5 * sensor.tissue.absorption_per_mm)
+    unlike = SpectralRenderer(dataclasses.replace(sensor, tissue=paler), device="cpu", like=first)
+    assert unlike.renderers[0].behind is not first.renderers[0].behind
+
+
 def test_colours_of_two_leds_are_summed_channel_by_channel(variant: str) -> None:
     """Each LED alone at its wavelength, times what the channels make of it."""
     from scenes import Renderer, SpectralRenderer

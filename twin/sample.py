@@ -234,13 +234,16 @@ _KEPT: dict[Sensor, SpectralRenderer] = {}
 
 
 def _renderer(design: Design) -> SpectralRenderer:
-    """Return the scene of the design's sensor, kept from the sample before where it is the same."""
+    """Return the scene of the design's sensor: that of the sample before, or what of it is the same."""
     from scenes import SpectralRenderer
 
     sensor = design.sensor()
     if sensor not in _KEPT:
+        before = next(iter(_KEPT.values()), None)
         _KEPT.clear()
-        _KEPT[sensor] = SpectralRenderer(sensor, count=design.light.bands, at=design.sensor, device="cpu")
+        _KEPT[sensor] = SpectralRenderer(
+            sensor, count=design.light.bands, at=design.sensor, device="cpu", like=before
+        )
     return _KEPT[sensor]
 
 
