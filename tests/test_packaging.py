@@ -35,7 +35,7 @@ def test_wheel_holds_every_source_and_asset(wheel: zipfile.ZipFile) -> None:
         path.relative_to(ROOT).as_posix()
         for room in ROOMS
         for path in (ROOT / room).rglob("*")
-        if path.is_file() and path.suffix in (".py", ".toml", ".bib", ".csv", ".json", ".npz")
+        if path.is_file() and path.suffix in (".py", ".toml", ".bib", ".csv", ".json", ".npz", ".safetensors")
     }
     assert "assets/references.bib" in wanted
     assert any(name.startswith("assets/designs/") for name in wanted)

@@ -205,12 +205,12 @@ def answer(task: Task) -> None:
         else:
             seen = averaged(estimator, source, task.number, levels, frames, task.seed)
         told = estimator.features(seen[None])
-        found: dict[str, Any] = {"presence": float(estimator.network.present(told, frames)[0])}
+        drawn = estimator.unscaled(estimator.network.sample(told, frames, _DRAWS, task.seed)[0])
+        found: dict[str, Any] = {"presence": estimator.presence(seen, frames, drawn.mean(axis=0))}
         row[str(frames)] = found
         if blank:
             continue
         truth = np.array([row["truth"]])
-        drawn = estimator.unscaled(estimator.network.sample(told, frames, _DRAWS, task.seed)[0])
         found["network"] = found["rendered"] = _short(drawn, truth)
         try:
             least, found["deflection"] = estimator.limits(values, frames)

@@ -26,7 +26,7 @@ from twin.complaint import DesignError, shown
 from twin.corpus import Corpus
 from twin.discrepancy import shrunk, told_by
 from twin.estimator import Estimator, Sight
-from twin.estimator_file import emulator_of, file_of, load_estimator, save_estimator
+from twin.estimator_file import emulator_of, file_of, load_estimator, save_estimator, shares_of
 from twin.fitting import inside, reachable
 from twin.frame import versions
 from twin.imagined import Brightness, check_field, mean_variance, pictures
@@ -49,6 +49,7 @@ def calibrate(
     *,
     samples: int | None = None,
     workers: int | None = None,
+    lean: bool = False,
     progress: Callable[[str, float], None] = lambda stage, share: None,
 ) -> str:
     """Write a model that also knows how far pictures of a corpus are from its own, as OUT.safetensors and
@@ -57,6 +58,7 @@ def calibrate(
     Parameters
     ----------
     samples : the first so many; all by default.
+    lean : as of `twin.estimator_file.save_estimator`.
 
     Raises
     ------
@@ -71,6 +73,8 @@ def calibrate(
     if not estimator.traced:
         allowed = "one that was trained on a corpus with --traced"
         raise DesignError("MODEL", "one without learned light", allowed, source=str(model))
+    if lean:
+        shares_of(emulator_of(model), estimator.traced)
     levels = levels_of(source, estimator)
     for field in source.plan.columns:
         if "." in field:
@@ -108,7 +112,7 @@ def calibrate(
             "off_percent": {"references": reference, "tared": of_tared},
         },
     }
-    save_estimator(replace(made, card=card), emulator_of(file_of(model)), place)
+    save_estimator(replace(made, card=card), emulator_of(model), place, lean=lean)
     return (
         f"{len(numbers)} inclusions of {source.name}: references are off by {reference:.2f} % of their mean, "
         f"tared pictures by {of_tared:.2f} % of their maximum (root mean square)\nmodel: {place}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 from typing import Any
 
 from twin.arguments import add_verb, number, whole
@@ -54,6 +55,9 @@ trained for, are refused in one line. The network's answer is refined by renderi
 inclusion, some 20 seconds, where that explains the pictures. With --out: estimate.json, and overview.png to
 look at.
 
+MODEL is a file of `twin train`, or tsis: the model that ships, of the design tsis pressed by 1, 2 and 2.9 mm,
+calibrated for full solves (ESTIMATE.md).
+
 FRAME is a folder of `twin simulate` (one press level or all), or a camera's PNG file of 8 or 16 bits, one for
 each of the model's press levels in order; these need --reference: the same presses without inclusion, in the
 same order. A camera below the sensor sees the mirror image, which --flip turns round. With --frames N each
@@ -61,11 +65,13 @@ level has N exposures, those of the first level first; references may be several
 exposures as they were taken: a mean that was rounded to whole counts is biased where it is dark.
 
 examples:
-  twin simulate tsis --size 10 --depth 5 --modulus 100 --indentation 1 2 3 --out levels
-  twin estimate tsis.safetensors levels --out estimate
-  twin estimate tsis.safetensors 1mm.png 2mm.png 3mm.png --reference r1.png r2.png r3.png --flip --out found
-  twin estimate tsis.safetensors 1mm-*.png 2mm-*.png 3mm-*.png --frames 10 --reference r?mm-*.png --flip
+  twin simulate tsis --size 10 --depth 5 --modulus 100 --indentation 1 2 2.9 --out levels
+  twin estimate tsis levels --out estimate
+  twin estimate tsis 1mm.png 2mm.png 3mm.png --reference r1.png r2.png r3.png --flip --out found
+  twin estimate my.safetensors 1mm-*.png 2mm-*.png 3mm-*.png --frames 10 --reference r?mm-*.png --flip
 """
+
+_MODEL = "what twin train wrote, FILE.safetensors, or tsis, which ships"
 
 
 def add(verbs: Any) -> None:
@@ -89,9 +95,10 @@ def add(verbs: Any) -> None:
         "--imagined", type=whole, metavar="N", help="specimens that the network is shown (default 16000)"
     )
     train.add_argument("--seed", type=whole, default=0, metavar="N", help="of all random numbers (default 0)")
+    _add_lean(train)
 
     assess = add_verb(verbs, "assess", "how well a model tells inclusions that it has not seen", _ASSESS)
-    assess.add_argument("model", metavar="MODEL", help="what twin train wrote, FILE.safetensors")
+    assess.add_argument("model", metavar="MODEL", help=_MODEL)
     assess.add_argument("corpus", metavar="CORPUS", help="folder of a finished corpus")
     assess.add_argument("--out", metavar="DIR", help="folder for the assessment")
     assess.add_argument("--samples", type=whole, metavar="N", help="at most so many (default: all)")
@@ -113,16 +120,17 @@ def add(verbs: Any) -> None:
     )
 
     calibrate = add_verb(verbs, "calibrate", "teach a model what known inclusions are beyond it", _CALIBRATE)
-    calibrate.add_argument("model", metavar="MODEL", help="what twin train wrote, FILE.safetensors")
+    calibrate.add_argument("model", metavar="MODEL", help=_MODEL)
     calibrate.add_argument("corpus", metavar="CORPUS", help="folder of a finished corpus")
     calibrate.add_argument("--out", metavar="MODEL", help="model to write, without its ending")
     calibrate.add_argument("--samples", type=whole, metavar="N", help="the first so many (default: all)")
     calibrate.add_argument(
         "--workers", type=whole, metavar="N", help="processes (default: one for each core)"
     )
+    _add_lean(calibrate)
 
     estimate = add_verb(verbs, "estimate", "an inclusion from pictures, with how sure that is", _ESTIMATE)
-    estimate.add_argument("model", metavar="MODEL", help="what twin train wrote, FILE.safetensors")
+    estimate.add_argument("model", metavar="MODEL", help=_MODEL)
     estimate.add_argument("frames", metavar="FRAME", nargs="+", help="folder of twin simulate, or PNG file")
     estimate.add_argument(
         "--reference", metavar="FILE", nargs="+", default=[], help="PNG files of the press without inclusion"
@@ -145,4 +153,13 @@ def add(verbs: Any) -> None:
     )
     estimate.add_argument(
         "--seed", type=whole, default=0, metavar="N", help="of the posterior's samples (default 0)"
+    )
+
+
+def _add_lean(verb: argparse.ArgumentParser) -> None:
+    verb.add_argument(
+        "--lean",
+        action="store_true",
+        help="leave out emulator and learned light, which must be those that ship: a smaller file, which "
+        "versions with the same can read",
     )

@@ -35,6 +35,7 @@ def _train(arguments: argparse.Namespace) -> int:
             samples=arguments.samples,
             imagined=arguments.imagined,
             seed=arguments.seed,
+            lean=arguments.lean,
             progress=report,
         )
     print(written)
@@ -57,6 +58,7 @@ def _calibrate(arguments: argparse.Namespace) -> int:
             arguments.out.removesuffix(".safetensors"),
             samples=arguments.samples,
             workers=arguments.workers,
+            lean=arguments.lean,
             progress=report,
         )
     print(written)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 import fem
 from estimation.features import Features
@@ -20,6 +21,7 @@ from twin.discrepancy import Discrepancy
 from twin.estimates import NAMES, Estimate
 from twin.fitting import Fitted, Near, Prior, fit, limits, reachable
 from twin.imagined import mean_variance
+from twin.presence import presence
 from twin.put_back import put_back, where
 from twin.received import Received
 from twin.refining import Refined, refine
@@ -74,6 +76,7 @@ class Estimator:
     calibration: Sight | None = None
     """What `twin calibrate` gave; the network does not know of it."""
 
+    @threadpool_limits.wrap(limits=1)  # small matrices: on a busy machine threads only wait for each other
     def estimate(
         self, received: Received, *, samples: int = 4000, seed: int = 0, rendered: bool = True
     ) -> Estimate:
@@ -87,13 +90,13 @@ class Estimator:
         counts = seen + black(self.chain)
         like, strangest = likeness.likeness(self.novelty, counts[:, 0], counts[:, 1])
         told = self.features(seen[None])
-        presence = float(self.network.present(told, frames)[0])
         drawn = self.unscaled(self.network.sample(told, frames, samples, seed)[0])
+        there = self.presence(seen, frames, drawn.mean(axis=0))
         reason = None
         if like < self.card["refuse_below"]:
             reason = f"pictures unlike this sensor's: {strangest}"
         refined = None
-        if rendered and self.traced and reason is None and presence >= 0.5:
+        if rendered and self.traced and reason is None and there >= 0.5:
             start = drawn.mean(axis=0)
             refined = self.refined(seen, frames, start, samples=samples, seed=seed)
             if refined is None or not refined.explains:
@@ -115,7 +118,7 @@ class Estimator:
             wanted.mean(axis=0),
             np.cov(wanted.T),
             np.percentile(wanted, [5.0, 95.0], axis=0).T,
-            presence,
+            there,
             like,
             reason,
             np.asarray(seen[:, 0] - seen[:, 1], np.float64),
@@ -124,6 +127,16 @@ class Estimator:
             method,
             fitted.chi_square / len(self.sight.features.spread),
         )
+
+    def presence(self, seen: Single, frames: float, start: NDArray[np.floating]) -> float:
+        """Return the probability of an inclusion, for coarse counts (levels, 2, r, c): the network's, or that
+        of `presence.presence` by a fit from a start (5,), where the model is calibrated."""
+        if self.calibration is None:
+            return float(self.network.present(self.features(seen[None]), frames)[0])
+        sight, fitted = self.sight, self.fitted(seen, frames, start)
+        told = sight.features(seen[None])[0]
+        off = sight.error + sight.off(fitted.pictures)
+        return presence(self.chain, sight.features, self.prior, told, frames, fitted, off)
 
     def normal(self, fitted: Fitted, samples: int, seed: int) -> NDArray[np.float64]:
         """Samples (n, 5) about the most probable specimen, within the prior's ranges."""

@@ -1,7 +1,8 @@
 """The files of a trained estimator.
 
 A model is two files: NAME.safetensors holds arrays only (network, light map, features, likeness, the emulator
-of the mechanics), NAME.json its card. Neither can run code.
+of the mechanics, learned light), NAME.json its card. Neither can run code. A lean model holds no emulator and
+learned light, but the hashes of those that ship, which it is of no use without.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections.abc import Sequence
 from dataclasses import fields
 from io import BytesIO
 from pathlib import Path
@@ -25,7 +27,8 @@ from estimation.features import Features
 from estimation.light_map import LightMap
 from estimation.posterior import restored
 from scenes import traced
-from twin import likeness
+from scenes.traced import TracedLight
+from twin import learned, likeness
 from twin.chain import Chain
 from twin.complaint import DesignError, shown
 from twin.design import parse_design
@@ -62,10 +65,24 @@ def without_luminaires(tables: dict[str, Any]) -> dict[str, Any]:
     return {**tables, "leds": [{**led, "ies": None} if isinstance(led, dict) else led for led in leds]}
 
 
-def save_estimator(estimator: Estimator, emulator: bytes, path: str | Path) -> Path:
-    """Write NAME.safetensors and NAME.json; ``path`` is the former's. The card is written last."""
+def save_estimator(estimator: Estimator, emulator: bytes, path: str | Path, *, lean: bool = False) -> Path:
+    """Write NAME.safetensors and NAME.json; ``path`` is the former's. The card is written last.
+
+    Parameters
+    ----------
+    emulator : the file of its mechanics.
+    lean : without emulator and learned light, a third of the size, where they are those that ship.
+
+    Raises
+    ------
+    DesignError
+        For a lean model of others.
+    """
     target = Path(path)
-    arrays: dict[str, NDArray[Any]] = {"emulator": np.frombuffer(emulator, np.uint8)}
+    shares = shares_of(emulator, estimator.traced) if lean else None
+    arrays: dict[str, NDArray[Any]] = {}
+    if shares is None:
+        arrays |= {"emulator": np.frombuffer(emulator, np.uint8)}
     parts: dict[str, Any] = {"light": estimator.chain.light, "features": estimator.features}
     for name, part in parts.items():
         arrays |= {
@@ -81,7 +98,7 @@ def save_estimator(estimator: Estimator, emulator: bytes, path: str | Path) -> P
         assert sight.discrepancy is not None  # a calibration is made of one
         arrays |= {"sight.error": sight.error}
         arrays |= {f"sight.{name}": value for name, value in vars(sight.discrepancy).items()}
-    for number, one in enumerate(estimator.traced):
+    for number, one in enumerate(() if shares else estimator.traced):
         arrays |= {f"traced.{number}.{name}": getattr(one, name) for name in traced.ARRAYS}
     arrays |= {f"novelty.{name}": np.asarray(value) for name, value in estimator.novelty.items()}
     arrays |= {f"network.{k}": v.detach().numpy() for k, v in estimator.network.state_dict().items()}
@@ -97,6 +114,7 @@ def save_estimator(estimator: Estimator, emulator: bytes, path: str | Path) -> P
             {"key": one.key, "presses": one.presses, "error_percent": one.error_percent}
             for one in estimator.traced
         ],
+        "shares": shares,
         "sha256": hashlib.sha256(data).hexdigest(),
     }
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -111,9 +129,8 @@ def save_estimator(estimator: Estimator, emulator: bytes, path: str | Path) -> P
 
 
 def file_of(model: str | Path) -> Path:
-    """Return the place of a model's arrays."""
-    place = Path(model)
-    return place if place.suffix == ".safetensors" else place.with_name(place.name + ".safetensors")
+    """Return the place of a model's arrays; see `learned.model_file`."""
+    return learned.model_file(model)
 
 
 def card_of(path: Path) -> Path:
@@ -132,6 +149,8 @@ def load_estimator(path: str | Path) -> Estimator:
     place, name = file_of(path), str(path)
     if not place.is_file() or not card_of(place).is_file():
         allowed = "a .safetensors file of `twin train`, its .json beside it"
+        if learned.models():
+            allowed += f", or {', '.join(learned.models())}, which ships"
         raise DesignError("MODEL", shown(name), allowed)
     try:
         card = _card(card_of(place))
@@ -225,7 +244,8 @@ def _assembled(card: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Estimat
     network = restored(card["network"], state)
     if network.size["k"] != k or network.size["p"] != 5:
         raise ValueError("network.size")
-    emulator = fem.load_emulator(BytesIO(arrays["emulator"].tobytes()))
+    shares = card.get("shares")
+    emulator = fem.load_emulator(BytesIO(_emulator(card, arrays)))
     strange = {
         name.removeprefix("novelty."): value for name, value in arrays.items() if name.startswith("novelty.")
     }
@@ -237,8 +257,10 @@ def _assembled(card: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Estimat
             str(said["key"]),
             float(said["error_percent"]),
         )
-        for number, said in enumerate(card["traced"])
+        for number, said in enumerate(() if shares else card["traced"])
     )
+    if shares:
+        lights = traced.load(_shipped(shares, "light"))
     chain = Chain(design, emulator, light)
     return Estimator(card, chain, features, network, prior, arrays["error"], strange, lights, sight)
 
@@ -255,5 +277,46 @@ def _features(arrays: dict[str, NDArray[Any]], start: str, shape: tuple[int, int
 
 def emulator_of(path: str | Path) -> bytes:
     """Return the emulator's file in a model's."""
-    with safetensors.safe_open(path, "numpy") as file:
-        return bytes(file.get_tensor("emulator").tobytes())
+    place = file_of(path)
+    with safetensors.safe_open(place, "numpy") as file:
+        arrays = {name: file.get_tensor(name) for name in ("emulator",) if name in file.keys()}  # noqa: SIM118
+    return _emulator(_card(card_of(place)), arrays)
+
+
+def _emulator(card: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> bytes:
+    shares = card.get("shares")
+    return _shipped(shares, "emulator").read_bytes() if shares else arrays["emulator"].tobytes()
+
+
+def shares_of(emulator: bytes, lights: Sequence[TracedLight]) -> dict[str, str]:
+    """Return whose emulator and light a lean model shares, with their hashes. Raises `DesignError` for others
+    than those that ship."""
+    for name in learned.shipped():
+        files = {"emulator": learned.emulator_file(name), "light": learned.light_file(name)}
+        light = traced.load(files["light"])
+        same = len(light) == len(lights) and all(
+            np.array_equal(getattr(one, part), getattr(other, part))
+            for one, other in zip(light, lights, strict=True)
+            for part in traced.ARRAYS
+        )
+        if same and files["emulator"].read_bytes() == emulator:
+            return {"name": name} | {part: _sha256(place) for part, place in files.items()}
+    allowed = f"it for a model of the emulator and learned light that ship ({', '.join(learned.shipped())})"
+    raise DesignError("--lean", "it for a model of others", allowed)
+
+
+def _shipped(shares: Any, part: str) -> Path:
+    """Return a file that a lean model shares, if it is still the same."""
+    name = shares.get("name") if isinstance(shares, dict) else None
+    if name not in learned.shipped():
+        raise DesignError("shares", shown(name), ", ".join(learned.shipped()))
+    place = learned.emulator_file(name) if part == "emulator" else learned.light_file(name)
+    if _sha256(place) != shares.get(part):
+        raise DesignError(
+            f"shares.{part}", f"that of {name} in another version", "a model trained with this version's"
+        )
+    return place
+
+
+def _sha256(place: Path) -> str:
+    return hashlib.sha256(place.read_bytes()).hexdigest()

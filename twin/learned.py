@@ -1,8 +1,9 @@
-"""Learned once, used by everyone: the emulators of contact fields and the traced light that ship, and where
-others are looked for.
+"""Learned once, used by everyone: the emulators of contact fields, the traced light and the trained models
+that ship, and where others are looked for.
 
 `assets/emulators/tsis.npz` is the emulator of the design `tsis`, `tsis.light.npz` its traced light, each as
-`twin emulate` wrote it.
+`twin emulate` wrote it; `assets/models/tsis.safetensors` and `.json` are an estimator, as
+`twin calibrate --lean` wrote it.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ FOLDER = Path("emulators")
 """Folder where a design's own emulator is looked for: `tsis.npz` for the design `tsis`."""
 
 _LIGHT = ".light.npz"
+_MODEL = ".safetensors"
 
 
 def shipped() -> list[str]:
@@ -32,6 +34,20 @@ def light_file(name_or_file: str | Path, folder: Path = Path()) -> Path:
     return _found(name_or_file, folder, _LIGHT)
 
 
+def models() -> list[str]:
+    """Return the names of the models that come with the package."""
+    return sorted(place.name.removesuffix(_MODEL) for place in _assets("models").glob(f"*{_MODEL}"))
+
+
+def model_file(name_or_file: str | Path) -> Path:
+    """Return the file of a trained model, its ending left out or not: one that is there, else a shipped one
+    of this name."""
+    name = str(name_or_file).removesuffix(_MODEL)
+    place = Path(name + _MODEL)
+    shipped_one = not place.exists() and str(name_or_file) in models()
+    return _assets("models") / (name + _MODEL) if shipped_one else place
+
+
 def usual_emulator(design: str) -> Path:
     """Return the emulator of a design of this name if none is given: in `FOLDER`, else the shipped one."""
     own = FOLDER / f"{design}.npz"
@@ -43,5 +59,5 @@ def _found(name_or_file: str | Path, folder: Path, ending: str) -> Path:
     return _assets() / (name + ending) if name in shipped() else folder / name_or_file
 
 
-def _assets() -> Path:
-    return Path(str(files("assets"))) / "emulators"
+def _assets(folder: str = "emulators") -> Path:
+    return Path(str(files("assets"))) / folder

@@ -34,7 +34,7 @@ from twin.complaint import DesignError, shown
 from twin.corpus import Corpus
 from twin.design import Design
 from twin.estimator import Estimator, black
-from twin.estimator_file import save_estimator, without_luminaires
+from twin.estimator_file import save_estimator, shares_of, without_luminaires
 from twin.fields import tables_of
 from twin.fitting import prior_of
 from twin.frame import versions
@@ -96,6 +96,7 @@ def train(
     imagined: int | None = None,
     samples: int | None = None,
     workers: int | None = None,
+    lean: bool = False,
     progress: Progress | None = None,
 ) -> str:
     """Train an estimator on a corpus, write it as OUT.safetensors and OUT.json, and say how well it does.
@@ -106,6 +107,7 @@ def train(
     minutes : the longest that the network is trained.
     imagined : specimens that it is trained on, 100 or more; by default `IMAGINED`.
     samples : of the corpus that the light map is learned from, at most; all by default.
+    lean : as of `twin.estimator_file.save_estimator`.
 
     Raises
     ------
@@ -121,6 +123,9 @@ def train(
     if plan.emulator is None:
         raise DesignError("mechanics", shown(plan.mechanics), '"emulator"', source=source.name)
     emulator = fem.load_emulator(plan.emulator)
+    lights = () if plan.traced is None else traced.load(plan.traced)
+    if lean:
+        shares_of(plan.emulator.read_bytes(), lights)  # refused now, not in an hour
     chosen = tuple(range(source.levels)) if levels is None else tuple(levels)
     parts.mkdir(parents=True, exist_ok=True)
     seen = gather(source, emulator, parts, lambda share: tell("pictures", 0.2 * share))
@@ -181,7 +186,7 @@ def train(
         prior_of(ranges, many),
         np.asarray(error.T @ error / max(len(error), 1), np.float64),
         likeness_of(chain, inputs[:LIKE], many[:LIKE], errors, seed),
-        () if plan.traced is None else traced.load(plan.traced),
+        lights,
     )
     metrics: dict[str, Any] = {}
     if len(testing.numbers):
@@ -189,7 +194,7 @@ def train(
             estimator, source, testing, chosen, seed, lambda s: tell("test", 0.9 + 0.1 * s)
         )
     estimator = replace(estimator, card={**estimator.card, "metrics": metrics})
-    save_estimator(estimator, plan.emulator.read_bytes(), place)
+    save_estimator(estimator, plan.emulator.read_bytes(), place, lean=lean)
     return assess.words(metrics, str(place))
 
 
