@@ -71,7 +71,7 @@ def save_estimator(estimator: Estimator, emulator: bytes, path: str | Path, *, l
     Parameters
     ----------
     emulator : the file of its mechanics.
-    lean : without emulator and learned light, a third of the size, where they are those that ship.
+    lean : without emulator and learned light, half of the size, where they are those that ship.
 
     Raises
     ------

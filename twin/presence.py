@@ -46,7 +46,6 @@ def presence(
     seen, slopes = jacobian(chain, features, prior, fitted.x)
     gain = chain.gain(prior.values(fitted.x))
     noise = linalg.cho_factor(covariance(chain, features, seen, gain, frames, prior.pattern) + off)
-
     precision = prior.precision
 
     def judged(x: Floats, seen: NDArray[np.float32], slopes: Floats) -> tuple[_Case, Floats]:
