@@ -1,6 +1,9 @@
 """What an assessment says of answers whose worth is known, and what parts of a picture are worth."""
 
+import dataclasses
 import json
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import browser
@@ -130,6 +133,35 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path: Any) -> None:
     (tmp_path / "mine" / "letter.txt").write_text("dear")
     with pytest.raises(DesignError, match="--out"):
         assessing._claim(tmp_path / "mine", told)
+
+
+def test_an_answer_that_is_kept_is_not_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Means of many exposures, asked for later, are put beside the one exposure's answer of before."""
+    network = SimpleNamespace(sample=lambda told, frames, count, seed: np.zeros((1, count, 3)))
+    estimator = SimpleNamespace(
+        features=lambda seen: seen,
+        network=network,
+        unscaled=lambda drawn: drawn,
+        presence=lambda seen, frames, middle: 0.01 * frames,
+    )
+    plan = SimpleNamespace(parameters=lambda number: {}, inclusion=lambda number: None)
+    for name, value in (
+        ("loaded", lambda model: estimator),
+        ("opened", lambda corpus: SimpleNamespace(plan=plan)),
+        ("levels_of", lambda source, estimator: [0]),
+        ("stored", lambda *asked: np.zeros(3)),
+        ("averaged", lambda *asked: np.zeros(3)),
+    ):
+        monkeypatch.setattr(assessing, name, value)
+    one = assessing.Task("model", "corpus", 7, tmp_path / "000007.json", True, 0, (1,))
+    assessing.answer(one)
+    assert json.loads(one.place.read_bytes())["1"] == {"presence": 0.01}
+    monkeypatch.setattr(assessing, "stored", None)  # would fail if it were asked for again
+    both = dataclasses.replace(one, exposures=(1, 100))
+    assert assessing._done(one) and not assessing._done(both)
+    assessing.answer(both)
+    row = json.loads(one.place.read_bytes())
+    assert row["1"] == {"presence": 0.01} and row["100"] == {"presence": 1.0} and assessing._done(both)
 
 
 def test_information_of_the_scalars_is_that_of_noisy_pictures() -> None:

@@ -163,10 +163,14 @@ def _claim(folder: Path, told: Mapping[str, Any]) -> None:
 
 
 def _done(task: Task) -> bool:
-    if not task.place.is_file():
-        return False
-    row = json.loads(task.place.read_bytes())
-    return (row["rendered"] or not task.rendered) and all(str(frames) in row for frames in task.exposures)
+    row = _begun(task)
+    return all(str(frames) in row for frames in task.exposures)
+
+
+def _begun(task: Task) -> dict[str, Any]:
+    """What an earlier run has kept of a sample; nothing where it was answered with less than is asked for."""
+    row: dict[str, Any] = json.loads(task.place.read_bytes()) if task.place.is_file() else {}
+    return row if row.get("rendered") or not task.rendered else {}
 
 
 @lru_cache(maxsize=1)
@@ -188,18 +192,18 @@ def answer(task: Task) -> None:
     levels = levels_of(source, estimator)
     values = level_names({k: v for k, v in plan.parameters(task.number).items() if v is not None}, levels)
     blank = plan.inclusion(task.number) is None
-    row: dict[str, Any] = {
+    row = _begun(task) or {
         "sample": task.number,
         "blank": blank,
         "truth": None if blank else [values[name] for name in NAMES],
         "rendered": task.rendered,
     }
-    if not blank:
+    if not blank and "parts" not in row:
         with suppress(fem.NotModelled):
             parts = ablation.bounds(estimator.chain, estimator.prior, values)
             row["parts"] = {name: sd.tolist() for name, sd in parts.items()}
     near, start = None, None
-    for frames in task.exposures:
+    for frames in (count for count in task.exposures if str(count) not in row):
         if frames == 1:
             seen = stored(estimator, source, task.number, levels)
         else:
