@@ -5,6 +5,7 @@ Import only after a variant is set (`scenes.backend.use`).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -24,7 +25,7 @@ from .lamp import Patterns
 from .passage import Seen
 from .sensor import Sensor
 from .tissue import Coupling
-from .view import PixelRays, faces_reflectance
+from .view import PixelRays, faces_transmittance
 
 Array = NDArray[np.float64]
 
@@ -100,6 +101,7 @@ def glance(scene: mi.Scene, sensor: Sensor, table: Table, coupling: Coupling, ra
     """The same, not evaluated: Dr.Jit differentiates it to the scene's surface and to the table."""
     guide = sensor.guide
     origin, direction, gain, mirrored = on_device(rays)
+    kept = _kept_by_guide(sensor)
     contact = next(shape for shape in scene.shapes() if shape.id() == "contact")
 
     named = {shape.id(): mi.ShapePtr(shape) for shape in scene.shapes()}
@@ -116,9 +118,11 @@ def glance(scene: mi.Scene, sensor: Sensor, table: Table, coupling: Coupling, ra
     start = origin + STEP_MM / direction.z * direction
     for _ in range(_SIGHTS):
         for rung in climb(scene, sensor, start, direction):
+            gain *= kept(rung.met.t)
             _add_lamps(lamps, rung.met, gain * deeper[rung.layer - 1], sensor, named, patterns)
             gain = dr.select(rung.passes, gain, 0.0)
         si = meet(scene, named["contact"], start, direction)
+        gain *= kept(si.t)
         seen = si.is_valid() & (si.shape == named["contact"])
         _add_lamps(lamps, si, gain, sensor, named, patterns)
         windows.append(gain)
@@ -135,9 +139,11 @@ def glance(scene: mi.Scene, sensor: Sensor, table: Table, coupling: Coupling, ra
         gain = dr.select(seen, gain * (1.0 - transmitted), 0.0)
         down = mi.Vector3f(direction.x, direction.y, -direction.z)
         below = scene.ray_intersect(mi.Ray3f(si.p + STEP_MM * down, down), seen)
+        gain *= kept(below.t)
         _add_lamps(lamps, below, gain, sensor, named, patterns)
         through = below.is_valid() & (below.shape == named["layer_1" if guide.lower else "guide_to_glass"])
         for rung in descend(scene, sensor, si.p, down):
+            gain *= kept(rung.met.t)
             alight = dr.select(through, gain * deeper[rung.layer - 1], 0.0)
             _add_lamps(lamps, rung.met, alight, sensor, named, patterns)
             through &= rung.passes
@@ -164,7 +170,8 @@ def _housing(
 ) -> list[housing.Mirror]:
     """How pixels see the housing: straight by the faces below, and from a point of the contact that mirrors
     this share of radiance in the guide. Slopes there are left out, and so are ways with two mirrors."""
-    n, (_, _, clear, mirrored) = sensor.guide.refractive_index, on_device(rays)
+    n, passed, mirrored = sensor.guide.refractive_index, floats(rays.passed), floats(rays.mirrored_outside)
+    clear = floats(rays.transmittance)
     sine_x, sine_y = n * direction.x, n * direction.y  # in air
     in_air = dr.rsqrt(dr.maximum(1.0 - dr.square(sine_x) - dr.square(sine_y), 1e-6))
     lean_x, lean_y = sine_x * in_air, sine_y * in_air
@@ -172,7 +179,7 @@ def _housing(
     # below the first layer it is the way up again
     x = point.x + run * direction.x + origin.x - away * lean_x
     y = point.y + run * direction.y + origin.y - away * lean_y
-    by_contact = gain * (1.0 - mirrored) * n**2
+    by_contact = gain * passed * n**2
     return housing.mirrors(
         sensor, (lean_x, lean_y), (x, y), dr.select(clear > 0.0, mirrored, 0.0), by_contact
     )
@@ -187,15 +194,23 @@ def on_device(rays: PixelRays) -> tuple[mi.Point3f, mi.Vector3f, mi.Float, mi.Fl
     return mi.Point3f(x, y, z), mi.Vector3f(*direction), gain, mirrored
 
 
+def _kept_by_guide(sensor: Sensor) -> Callable[[mi.Float], mi.Float]:
+    """What the guide leaves of light on a way of so many mm (Beer's law)."""
+    absorption = sensor.guide.absorption_per_mm
+    if absorption == 0.0:
+        return lambda run: mi.Float(1.0)
+    return lambda run: dr.exp(-absorption * run)
+
+
 def _in_layers(sensor: Sensor, rays: PixelRays) -> list[mi.Float]:
     """Radiance at the camera per radiance in each lower layer, over that in the first one, of pixels' rays.
 
     (On the way to a mirror image the share that faces between layers send back, 1e-3, counts as passed.)
     """
     first = sensor.guide.refractive_index
-    through, cosine, found = 1.0 - rays.mirrored, rays.direction[..., 2], []
+    cosine, found = rays.direction[..., 2], []
     for k, layer in enumerate(sensor.guide.lower, start=1):
-        ratio = (1.0 - faces_reflectance(sensor, cosine, k)) / np.maximum(through, 1e-9)
+        ratio = faces_transmittance(sensor, cosine, k) / np.maximum(rays.passed, 1e-9)
         ratio *= (first / layer.refractive_index) ** 2
         found.append(floats(ratio))
     return found
@@ -260,7 +275,8 @@ def _add_lamps_below(
         if led.side != "below":
             continue
         in_air = led.coupling == "air"
-        through = run + (glass.thickness_mm - (0.0 if in_air else led.gap_mm)) * per_index(n2)
+        in_glass = (glass.thickness_mm - (0.0 if in_air else led.gap_mm)) * per_index(n2)
+        through = run + in_glass
         medium = 1.0 if in_air else n2
         if in_air:
             through += led.gap_mm * per_index(1.0)
@@ -274,6 +290,8 @@ def _add_lamps_below(
         cosine = dr.sqrt(dr.maximum(1.0 - square / medium**2, 0.0))
         leaves = patterns.relative(mi.UInt32(number), cosine, -px, -py)
         seen = gain * (1.0 - lost) * (n1 / medium) ** 2 * radiance(led) * leaves
+        if glass.absorption_per_mm > 0.0:
+            seen *= dr.exp(-glass.absorption_per_mm * n2 * in_glass)
         lamps[number] += dr.select(meets, seen, 0.0)
 
 

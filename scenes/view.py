@@ -8,7 +8,7 @@ other way.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,10 @@ from scipy.optimize import brentq
 from .sensor import Sensor
 
 Array = NDArray[np.float64]
+
+SIGHT = 2
+"""Raised where what the camera sees of the same light changes: kept layout studies are judged anew.
+2: guide and glass absorb on the way to the camera, too."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,10 +34,11 @@ class PixelRays:
     origin_mm, direction : (rows, columns, 3)
         Point on the face between guide and glass (on the first layer's lower face), and unit direction.
     transmittance : (rows, columns)
-        Fresnel transmittance of all faces together, unpolarised, with the reflections between them summed; 0
-        where an LED below is in the way.
-    mirrored : (rows, columns)
-        `faces_reflectance` at their angle.
+        Transmittance of all faces and the glass together, unpolarised, with the reflections between them
+        summed; 0 where an LED below is in the way. What the guide absorbs is not in it.
+    passed, mirrored, mirrored_outside : (rows, columns)
+        The same without LEDs in the way; and the share that comes back at their angle, of light from the
+        guide and of light from the air.
     radiance_scale : float
         Radiance in air over radiance there of an unattenuated ray, 1/n² (conservation of étendue).
     """
@@ -41,7 +46,9 @@ class PixelRays:
     origin_mm: Array
     direction: Array
     transmittance: Array
+    passed: Array
     mirrored: Array
+    mirrored_outside: Array
     radiance_scale: float
 
 
@@ -126,9 +133,10 @@ def pixel_rays(sensor: Sensor) -> PixelRays:
         inside = _refract(in_air, layer.refractive_index)
         offset = offset + inside[..., :2] / inside[..., 2:] * layer.thickness_mm
     origin = np.concatenate([offset, np.full((*offset.shape[:2], 1), guide.floors_mm[0])], axis=-1)
-    mirrored = faces_reflectance(sensor, in_guide[..., 2])
-    transmittance = np.where(_blocked(sensor, in_air, in_glass), 0.0, 1.0 - mirrored)
-    return PixelRays(origin, in_guide, transmittance, mirrored, 1.0 / guide.refractive_index**2)
+    mirrored, passed = _stacked(sensor, in_guide[..., 2], 0, _fresnel)
+    outside = _outside(sensor, in_air[..., 2], in_guide[..., 2])
+    open_ = np.where(_blocked(sensor, in_air, in_glass), 0.0, passed)
+    return PixelRays(origin, in_guide, open_, passed, mirrored, outside, 1.0 / guide.refractive_index**2)
 
 
 def below_mm(sensor: Sensor) -> float:
@@ -156,30 +164,61 @@ def _blocked(sensor: Sensor, in_air: Array, in_glass: Array) -> NDArray[np.bool_
 
 def faces_reflectance(sensor: Sensor, cosine: Array, layer: int = 0) -> Array:
     """Share of light that all faces below a layer of the guide, those of the glass among them, send back,
-    same shape as `cosine` (in the first layer).
+    same shape as `cosine` (in the first layer). What the glass absorbs is left out of it."""
+    return _stacked(sensor, cosine, layer, _fresnel)[0]
 
-    Incoherent sum over the reflections between a face and all below it: R = R1 + (1 - R1)² R2 / (1 - R1 R2).
-    """
-    return _stacked(sensor, cosine, layer, _fresnel)
+
+def faces_transmittance(sensor: Sensor, cosine: Array, layer: int = 0) -> Array:
+    """Share of light that passes all of them, and the glass, into the air or from it."""
+    return _stacked(sensor, cosine, layer, _fresnel)[1]
 
 
 def faces_reflectances(sensor: Sensor, cosine: Array) -> tuple[Array, Array]:
     """`faces_reflectance` of s and of p polarised light."""
-    s, p = (_stacked(sensor, cosine, 0, lambda *face, way=way: _fresnel_apart(*face)[way]) for way in (0, 1))
+    s, p = (
+        _stacked(sensor, cosine, 0, lambda *face, way=way: _fresnel_apart(*face)[way])[0] for way in (0, 1)
+    )
     return s, p
 
 
-def _stacked(sensor: Sensor, cosine: Array, layer: int, fresnel: Callable[..., Array]) -> Array:
+def _stacked(sensor: Sensor, cosine: Array, layer: int, fresnel: Callable[..., Array]) -> tuple[Array, Array]:
+    """Reflectance and transmittance of the faces below a layer, and of the glass between the last two.
+
+    Incoherent sums over the reflections between a face and all below it, behind what keeps `a` of the light
+    on one way: R = R1 + (1 - R1)² a² R2 / (1 - a² R1 R2), T = (1 - R1) a T2 / (1 - a² R1 R2).
+    """
     n2 = sensor.glass.refractive_index
     indices = [index for _, index in sensor.guide.layers]
     sine = indices[0] * np.sqrt(1.0 - np.asarray(cosine) ** 2)
-    second, below = fresnel(n2, 1.0, sine), n2
+    second = fresnel(n2, 1.0, sine)
+    through, below, kept = 1.0 - second, n2, _kept_by_glass(sensor, sine)
     for index in reversed(indices[layer:]):
         first = fresnel(index, below, sine)
-        passes = 1.0 - first * second  # 0 where the first face reflects all already
-        second = first + (1.0 - first) ** 2 * second / np.where(passes > 0.0, passes, 1.0)
-        below = index
-    return np.asarray(second)
+        passes = 1.0 - kept**2 * first * second  # 0 where the first face reflects all already
+        once = (1.0 - first) * kept / np.where(passes > 0.0, passes, 1.0)
+        second, through = first + (1.0 - first) * kept * once * second, once * through
+        below, kept = index, 1.0
+    return np.asarray(second), np.asarray(through)
+
+
+def _outside(sensor: Sensor, in_air: Array, in_guide: Array) -> Array:
+    """Share of light from the air that comes back, at these cosines. Faces that absorb nothing reflect alike
+    from both sides, which gives what those above the glass reflect."""
+    clear = replace(sensor, glass=replace(sensor.glass, absorption_per_mm=0.0))
+    sine = np.sqrt(1.0 - in_air**2)
+    last, both = _fresnel(sensor.glass.refractive_index, 1.0, sine), faces_reflectance(clear, in_guide)
+    above = (both - last) / ((1.0 - last) ** 2 + last * (both - last))
+    returned = _kept_by_glass(sensor, sine) ** 2 * above
+    return np.asarray(last + (1.0 - last) ** 2 * returned / (1.0 - last * returned))
+
+
+def _kept_by_glass(sensor: Sensor, n_sine: Array) -> Any:
+    """Share of light that the glass leaves on one way, at tangential index n sin(theta) (Beer's law)."""
+    glass = sensor.glass
+    if glass.absorption_per_mm == 0.0:
+        return 1.0
+    cosine = np.sqrt(np.maximum(1.0 - (n_sine / glass.refractive_index) ** 2, 1e-12))
+    return np.exp(-glass.absorption_per_mm * glass.thickness_mm / cosine)
 
 
 def _fresnel(n_in: float, n_out: float, n_sine: Array) -> Array:

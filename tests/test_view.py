@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from types import ModuleType
 from typing import Any
 
@@ -10,7 +11,7 @@ import pytest
 from sensors import HALF_MM, paper_sensor
 
 from scenes import view
-from scenes.sensor import Glass, Guide, Sensor
+from scenes.sensor import Glass, Guide, Lower, Sensor
 
 SENSORS = {
     "paper": paper_sensor(),
@@ -192,8 +193,9 @@ def test_glass_of_the_guides_index_leaves_one_face() -> None:
     np.testing.assert_allclose(ours, 0.5 * (r_s**2 + r_p**2), rtol=1e-12)
 
 
-def test_reflections_inside_the_glass_are_summed_to_the_last() -> None:
-    """Followed one by one, at 30 degrees in the guide."""
+@pytest.mark.parametrize("absorption", [0.0, 0.3])
+def test_reflections_inside_the_glass_are_summed_to_the_last(absorption: float) -> None:
+    """Followed one by one, at 30 degrees in the guide; through a glass that absorbs, too."""
     n1, n2 = 1.4336, 1.9
     cosine = np.cos(np.radians(30.0))
     cos2 = np.sqrt(1 - (n1 / n2) ** 2 * (1 - cosine**2))
@@ -205,13 +207,71 @@ def test_reflections_inside_the_glass_are_summed_to_the_last() -> None:
         return float(0.5 * (s**2 + p**2))
 
     r1, r2 = fresnel(n1, cosine, n2, cos2), fresnel(n2, cos2, 1.0, cos3)
-    back, inside = r1, 1.0 - r1
+    base = with_indices(n1, n2)
+    sensor = dataclasses.replace(base, glass=dataclasses.replace(base.glass, absorption_per_mm=absorption))
+    once = np.exp(-absorption * sensor.glass.thickness_mm / cos2)
+    back, through, inside = r1, 0.0, 1.0 - r1
     for _ in range(60):
-        back += inside * r2 * (1 - r1)
-        inside *= r2 * r1
-    assert float(view.faces_reflectance(with_indices(n1, n2), np.array(cosine))) == pytest.approx(
-        back, rel=1e-12
+        through += inside * once * (1 - r2)
+        back += inside * once**2 * r2 * (1 - r1)
+        inside *= once**2 * r2 * r1
+    assert float(view.faces_reflectance(sensor, np.array(cosine))) == pytest.approx(back, rel=1e-12)
+    assert float(view.faces_transmittance(sensor, np.array(cosine))) == pytest.approx(through, rel=1e-12)
+
+    outside, inside = r2, 1.0 - r2
+    for _ in range(60):
+        outside += inside * once**2 * r1 * (1 - r2)
+        inside *= once**2 * r2 * r1
+    found = view._outside(sensor, np.array(cos3), np.array(cosine))
+    assert float(found) == pytest.approx(outside, rel=1e-12)
+
+
+@pytest.mark.parametrize("lower", [(), (Lower(3.0, 1.5), Lower(2.0, 1.41))], ids=["one", "three"])
+def test_light_is_absorbed_on_its_way_to_the_camera(mi: ModuleType, lower: tuple[Lower, ...]) -> None:
+    """Beer's law along the pixels' rays through glass, layers and guide to a raised, tilted plane; and along
+    those that the lower faces have mirrored, which go through the guide three times."""
+    from scenes import build, gather
+    from scenes.bsdf import Table
+    from scenes.surface import NODES, OpticalSurface
+    from scenes.tissue import couple, tissue_optics
+
+    def windows(guide_per_mm: float, glass_per_mm: float) -> tuple[np.ndarray, view.PixelRays]:
+        base = paper_sensor(columns=48, rows=32, field_of_view_mm=20.0)
+        guide = dataclasses.replace(base.guide, absorption_per_mm=guide_per_mm, lower=lower)
+        glass = dataclasses.replace(base.glass, absorption_per_mm=glass_per_mm)
+        sensor = dataclasses.replace(base, guide=guide, glass=glass)
+        optics = build.optics_of(sensor)
+        coupling = couple(optics, tissue_optics(1.0, 0.02), guide.refractive_index, 1.40, 1.0)
+        packed = Table.pack(optics, coupling)
+        scene = build.load_scene(sensor, packed)
+        line = np.linspace(-HALF_MM, HALF_MM, NODES)
+        x, _ = np.meshgrid(line, line)
+        plane = np.stack([0 * x, 0 * x, -0.2 + 0.01 * x], axis=-1)
+        build.put_surface(scene, sensor, OpticalSurface(line, plane, np.zeros_like(x), 0 * x))
+        rays = view.pixel_rays(sensor)
+        return gather.look(scene, sensor, Table(packed), coupling, rays).windows.astype(float), rays
+
+    clear, rays = windows(0.0, 0.0)
+    n1, n_sine = 1.4336, 1.4336 * np.sqrt(1.0 - rays.direction[..., 2] ** 2)
+    in_first = (-0.2 + rays.origin_mm @ (slope := np.array([0.01, 0.0, -1.0]))) / -(rays.direction @ slope)
+    in_lower = sum(
+        (one.thickness_mm / np.sqrt(1.0 - (n_sine / one.refractive_index) ** 2) for one in lower),
+        np.zeros_like(n_sine),
     )
+    in_glass = 2.0 / np.sqrt(1.0 - (n_sine / 1.515) ** 2)
+    assert n1 == paper_sensor().guide.refractive_index
+
+    absorbed = windows(0.05, 0.0)[0] / clear
+    np.testing.assert_allclose(absorbed[0], np.exp(-0.05 * (in_first + in_lower)), rtol=2e-4)
+    # the plane leans, so that the three ways differ by some hundredths
+    thrice = -np.log(absorbed[1]) / 0.05 / (3.0 * (in_first + in_lower))
+    assert np.isfinite(thrice[8:-8, 12:-12]).all()
+    np.testing.assert_allclose(thrice[8:-8, 12:-12], 1.0, atol=0.02)
+
+    # what goes through the glass again after a reflection in it is a thousandth
+    absorbed = windows(0.0, 0.1)[0] / clear
+    np.testing.assert_allclose(absorbed[0], np.exp(-0.1 * in_glass), rtol=5e-4)
+    assert np.all(absorbed[1] < 0.7 * absorbed[0])
 
 
 def test_camera_looks_at_the_deformed_surface(mi: ModuleType) -> None:

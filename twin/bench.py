@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 import fem
 from scenes.traced import LIGHT
+from scenes.view import SIGHT
 from twin import coarse as pixels
 from twin import objectives, touches
 from twin.design import Design
@@ -192,5 +193,5 @@ class Work:
     def _light_key(
         self, what: str, inclusion: fem.Inclusion, level: float, place: tuple[float, float]
     ) -> Any:
-        own = optical_key(self.design), self.quality, self.seed, self.bench.paths(self.quality), LIGHT
+        own = optical_key(self.design), self.quality, self.seed, self.bench.paths(self.quality), LIGHT, SIGHT
         return self._key(what, inclusion, level, place), own, self.ground
