@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 
 from . import surface
-from .contact import contact_fraction
+from .contact import real_contact
 from .sensor import Sensor
 
 
@@ -23,9 +23,7 @@ def bodies(sensor: Sensor, deformed: surface.OpticalSurface) -> dict[str, trimes
     top = surface.triangulate(deformed)
     top.invert()  # light's normals point into the guide
     pressure = np.maximum(deformed.pressure_kPa, 0.0)  # the spline swings below zero where contact ends
-    fraction = contact_fraction(
-        pressure, sensor.effective_modulus_kPa, sensor.skin.rms_slope, sensor.skin.kappa
-    )
+    fraction = real_contact(pressure, sensor.skin, sensor.effective_modulus_kPa)
     fields = {
         "pressure": pressure,
         "contact_fraction": fraction,

@@ -63,6 +63,12 @@ class SpectralRenderer:
             for (_, _, one), other in zip(parts, others, strict=True)
         ]
 
+    @property
+    def response(self) -> NDArray[np.float64]:
+        """What the camera makes of each LED's light over what it makes of as much at the one wavelength where
+        it sees best, mean of its channels, (n_led,); 0 where it is blind."""
+        return np.asarray(sum(band.share.mean(axis=1) for band in self.bands))
+
     @cached_property
     def whole(self) -> Renderer:
         """The sensor with all its LEDs at its one wavelength."""
@@ -165,7 +171,7 @@ def band_sensors(
         leds = _alight(sensor, band)
         same = band.wavelength_nm == sensor.wavelength_nm
         there = at(band.wavelength_nm) if at and not same else sensor
-        chosen = tuple(_as_line(there.leds[number], number in band.lit) for number in leds)
+        chosen = tuple(_as_line(there.leds[number], number in band.leds) for number in leds)
         found.append((band, leds, replace(there, leds=chosen, wavelength_nm=band.wavelength_nm)))
     return found
 
@@ -178,7 +184,7 @@ def _mean(radiance: NDArray[np.float64]) -> float:
 def _alight(sensor: Sensor, band: Band) -> tuple[int, ...]:
     """The LEDs to put into a band's scene: those that shine, and those that stand in the way of light."""
     if all(led.coupling == "air" and led.side != "below" for led in sensor.leds):
-        return band.lit or (0,)
+        return band.leds
     return tuple(range(len(sensor.leds)))
 
 

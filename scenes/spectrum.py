@@ -51,17 +51,15 @@ class Band:
         Number of bands that share the spectrum of the LEDs lit here.
     energy : float
         Share of those LEDs' flux that the band stands for.
+    leds : tuple of int
+        Numbers of the LEDs that shine in this band, whether the camera sees them or not.
     """
 
     wavelength_nm: float
     share: Array
     parts: int
     energy: float
-
-    @property
-    def lit(self) -> tuple[int, ...]:
-        """Numbers of the LEDs that shine in this band."""
-        return tuple(int(number) for number in np.flatnonzero(self.share.any(axis=1)))
+    leds: tuple[int, ...] = ()
 
 
 def luminous_efficiency(wavelength_nm: ArrayLike) -> Array:
@@ -125,14 +123,21 @@ def bands(leds: Sequence[Led], camera: Camera, wavelength_nm: float, count: int)
         Of LEDs that are a line without `peak_nm`, and of the light that the sum is given as.
     """
     found: dict[tuple[str, float | None, float | None], list[Band]] = {}
+    members: dict[tuple[str, float | None, float | None], tuple[int, ...]] = {}
     for number, led in enumerate(leds):
         peak = wavelength_nm if led.spectrum == "line" and led.peak_nm is None else led.peak_nm
         key = (led.spectrum, peak, led.fwhm_nm)
         if key not in found:
             found[key] = _cut(key, camera, wavelength_nm, count, len(leds))
+            members[key] = ()
+        members[key] += (number,)
         for band in found[key]:
             band.share[number] = band.share[-1]
-    return [replace(band, share=band.share[:-1]) for group in found.values() for band in group]
+    return [
+        replace(band, share=band.share[:-1], leds=members[key])
+        for key, group in found.items()
+        for band in group
+    ]
 
 
 def _cut(

@@ -1,5 +1,6 @@
 """`twin export --mitsuba`, `--stl`, `--ply`: the stock package sees our scene, other programs our meshes."""
 
+import dataclasses
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
@@ -161,6 +162,20 @@ def test_meshes_are_the_pressed_guide(tmp_path, kind):
         assert 0.3 < np.median(fields["pressure"]) < 3.0
         assert fields["displacement_z"].min() < -0.2
         assert np.allclose(top.vertices[:, 2], fields["displacement_z"], atol=1e-5)
+
+
+def test_fraction_in_contact_is_the_lights() -> None:
+    """Adhesion closes all gaps: the mesh says what the light meets, as where contact is rough."""
+    from scenes import meshes, surface
+    from scenes.contact import real_contact
+
+    base = paper_sensor()
+    for contact in ("rough", "full"):
+        sensor = dataclasses.replace(base, skin=dataclasses.replace(base.skin, contact=contact))
+        top = meshes.bodies(sensor, surface.flat(25.0, 1.0))["contact"]
+        expected = real_contact(np.ones(1), sensor.skin, sensor.effective_modulus_kPa)
+        np.testing.assert_allclose(top.vertex_attributes["contact_fraction"], expected, rtol=1e-5)
+    assert expected == 1.0
 
 
 @pytest.mark.parametrize("flag", ["--mitsuba", "--stl", "--ply"])

@@ -33,6 +33,7 @@ def sound(**changes):
             )
         },
         "detected": np.full(4, 0.01),
+        "response": np.ones(4),
         "lit_percent": np.full(4, 25.0),
         "in_sight_percent": np.zeros(4),
         "light_is_pressed": True,
@@ -58,6 +59,17 @@ def share(checkup, name, value, leds=slice(None)):
 
 def test_a_sound_sensor_has_no_findings():
     assert findings(sound()) == []
+
+
+@pytest.mark.parametrize(
+    ("blind", "field"), [([1, 3], "leds.1.peak_nm, leds.3.peak_nm"), (range(4), "leds.*.peak_nm")]
+)
+def test_leds_that_the_camera_cannot_see_are_named(blind, field):
+    response = np.ones(4)
+    response[list(blind)] = 0.0
+    (finding,) = findings(sound(response=response))
+    assert finding.field == field and "blind" in finding.found
+    assert finding.rank == ("error" if len(blind) == 4 else "warning")
 
 
 def at(section, **values):

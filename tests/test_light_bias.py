@@ -85,6 +85,10 @@ def test_a_design_like_a_measured_one_is_told_its_figures(name: str, quality: st
         ({"surface__sheet": {"thickness_mm": 0.3, "modulus_kPa": 100.0}}, "a contact sheet"),
         ({"specimen__scattering_per_mm": 5.0}, "specimen.scattering_per_mm = 5 (alike: 0.5 to 2)"),
         ({"specimen__anisotropy": 0.9}, "specimen.anisotropy = 0.9"),
+        ({"glass__refractive_index": 1.8}, "glass.refractive_index = 1.8"),
+        ({"glass__absorption_per_mm": 0.3}, "glass.absorption_per_mm = 0.3"),
+        ({"surface__rms_height_um": 0.1}, "surface.rms_height_um = 0.1"),
+        ({"leds__z_mm": -8.0}, "LEDs far off the middle"),
         ({"waveguide__dome_radius_mm": 500.0}, "waveguide.dome_radius_mm = 500"),
         ({"waveguide__dome_radius_mm": 150.0, "leds__coupling": "embedded"}, "embedded, domed, rough"),
         ({"surface__gap_index": 1.2}, "air, flat, rough, 1.2"),
@@ -106,6 +110,12 @@ def test_other_light_is_told_why(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "together" in light_bias.bias_of(mixed, "standard")["bias_of"]
     below = dataclasses.replace(design, leds=(dataclasses.replace(design.leds[0], side="below"),))
     assert "LEDs below" in light_bias.bias_of(below, "standard")["bias_of"]
+    three = dataclasses.replace(design, leds=design.leds[:3])
+    assert "all four sides" in light_bias.bias_of(three, "standard")["bias_of"]
+    layers = [dict(layer) for layer in tables_of(design)["waveguide"]["layers"]]
+    layers[-1]["refractive_index"] = 1.55
+    layered = changed(waveguide__layers=layers)
+    assert "layers of different index" in light_bias.bias_of(layered, "standard")["bias_of"]
     monkeypatch.setattr(light_bias, "BIAS_SINCE", LIGHT + 1)
     told = light_bias.bias_of(design, "standard")
     assert told["bias_percent"] is None and "earlier version" in told["bias_of"]

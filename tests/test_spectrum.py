@@ -91,7 +91,7 @@ def test_bands_hold_all_electrons_of_every_channel() -> None:
     sensor = sensor_of({"spectrum": "LED-B3"}, {"peak_nm": 620.0}, colour="rgb", quantum_efficiency=RGB)
     camera = sensor.camera
     found = bands(sensor.leds, camera, 550.0, 4)
-    assert [band.lit for band in found] == [(0,)] * 4 + [(1,)]
+    assert [band.leds for band in found] == [(0,)] * 4 + [(1,)]
     share = sum(band.share for band in found)
     wavelength, density = shape("LED-B3", None, None)
     light = np.broadcast_to(share[0], (*camera.shape, 3))  # 1 W m-2 sr-1 at every wavelength alike
@@ -159,8 +159,29 @@ def test_three_bands_of_white_light_are_enough(variant: str) -> None:
 def test_camera_blind_to_an_led_sees_it_dark() -> None:
     sensor = sensor_of({"peak_nm": 850.0}, colour="rgb", quantum_efficiency=RGB)
     (band,) = bands(sensor.leds, sensor.camera, 550.0, 3)
-    assert not band.share.any() and band.lit == ()
+    assert not band.share.any() and band.leds == (0,)
     assert longest(sensor.leds, 550.0) == 850.0
+
+
+def test_light_that_the_camera_is_blind_to_is_followed_all_the_same(variant: str) -> None:
+    """Where it ends is a question about the sensor: the sinks of both LEDs add up to what they emit."""
+    from scenes import SpectralRenderer
+
+    base = paper_sensor(columns=96, rows=64, pixel_um=(67.0, 75.0))
+    camera = dataclasses.replace(base.camera, colour="rgb", quantum_efficiency=RGB)
+    leds = tuple(
+        dataclasses.replace(led, peak_nm=peak) for led, peak in zip(base.leds, (850.0, 525.0), strict=False)
+    )
+    one = SpectralRenderer(dataclasses.replace(base, camera=camera, leds=leds), device="cpu")
+    assert one.response[0] == 0.0 < one.response[1]
+    assert len(one.whole.sensor.leds) == 2
+    found = one.render(bump(), quality="preview", samples=2**14)
+    assert found.sinks is not None
+    np.testing.assert_allclose(found.sinks.sum(axis=1), [led.flux_W for led in leds], rtol=0.02)
+    assert not found.radiance[0].any() and found.radiance[1].any()
+    dark = tuple(dataclasses.replace(led, peak_nm=850.0) for led in base.leds)
+    blind = SpectralRenderer(dataclasses.replace(base, camera=camera, leds=dark), device="cpu")
+    assert len(blind.renderers) == 1 and len(blind.whole.sensor.leds) == 4
 
 
 def test_line_renders_the_same_bytes_as_one_renderer(variant: str) -> None:

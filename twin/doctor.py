@@ -93,7 +93,9 @@ class Checkup:
     """What happens first: ``missed`` never enters the guide; ``trapped`` and ``leaked`` come to the contact
     surface beyond and within the critical angle to the gaps; ``elsewhere`` never comes to it."""
     detected: Array
-    """Through the lens onto the pixels: a part of what leaves below."""
+    """Through the lens onto the pixels: a part of what leaves below; 0 of what the camera is blind to."""
+    response: Array
+    """What the camera makes of each LED's light, over light that it sees best."""
     lit_percent: Array
     """Share of the picture's light above black that each LED gives."""
     in_sight_percent: Array
@@ -220,7 +222,8 @@ def check_up(
         emitted_W=emitted,
         sinks=_sinks(lit, emitted),
         first=_first(design, lit, recorded, emitted),
-        detected=_detected(design, lit, emitted),
+        detected=_detected(design, lit, emitted, renderer.response),
+        response=renderer.response,
         lit_percent=_shares(lit),
         in_sight_percent=in_sight,
         light_is_pressed=blank is not None,
@@ -304,14 +307,15 @@ def _first(design: Design, rendering: Rendering, paths: Paths, emitted: Array) -
     return first
 
 
-def _detected(design: Design, rendering: Rendering, emitted: Array) -> Array:
-    """Flux of each LED on the pixels, per cent: what the entrance pupil takes of the field of view."""
+def _detected(design: Design, rendering: Rendering, emitted: Array, response: Array) -> Array:
+    """Flux of each LED on the pixels, per cent: what the entrance pupil takes of the field of view. Radiance
+    is what the camera makes of it (`response`); 0 where it is blind."""
     from scenes.camera import irradiance
 
     camera = design.camera
     area_m2 = camera.pitch_mm[0] * camera.pitch_mm[1] * 1e-6
     flux = [grey(irradiance(camera, layer)).sum() * area_m2 for layer in rendering.radiance]
-    return _percent(np.array(flux), emitted)
+    return _percent(np.array(flux), emitted * response)
 
 
 def _shares(rendering: Rendering) -> Array:
@@ -369,7 +373,8 @@ def _signal(design: Design, standard: Rendering, blank: Rendering, seed: int) ->
     tared -= np.minimum(mean_counts(camera, unlit, wavelength), top)
     tared = grey(tared)
     # where half a millimetre is brightest: the brightest pixels alone would be the light's Monte Carlo noise
-    pixel = camera.field_of_view_mm / camera.columns, camera.field_height_mm / camera.rows
+    rows_, columns_ = camera.shape
+    pixel = camera.field_of_view_mm / columns_, camera.field_height_mm / rows_
     window = [max(round(_PLACE_MM / pixel[1]), 1), max(round(_PLACE_MM / pixel[0]), 1)]
     row, column = np.unravel_index(int(uniform_filter(tared, window, mode="nearest").argmax()), tared.shape)
     counts = uniform_filter(tared, 3, mode="nearest")[row, column]

@@ -134,8 +134,11 @@ def _left_out(design: Design) -> Iterator[str]:
         yield "paint on the side walls"
     if any(led.pattern != "lambertian" or led.tilt_deg != 0.0 for led in leds):
         yield "the LEDs' patterns (they are Lambertian)"
-    if any(led.spectrum != "line" for led in leds):
-        yield f"the LEDs' spectra (all is at {design.light.wavelength_nm:g} nm)"
+    at = design.light.wavelength_nm
+    if any(led.spectrum != "line" or led.peak_nm not in (None, at) for led in leds):
+        yield f"the LEDs' spectra (all is at {at:g} nm), and what the camera makes of them"
+    if design.camera.ambient > 0.0:
+        yield "ambient light"
 
 
 def _write_scene(design: Design, deformed: OpticalSurface, folder: Path) -> str:

@@ -110,6 +110,15 @@ def _leds(checkup: Checkup) -> Iterator[Finding]:
     for number in sorted(set(range(len(leds))) - set(lit)):
         why = "Its layer of the picture is black"
         yield Finding("warning", f"leds.{number}.flux_W", "is 0, a failed LED", why, "Set its flux in W")
+    blind = [number for number in lit if checkup.response[number] == 0.0]
+    if blind:
+        yield Finding(
+            "error" if len(blind) == len(lit) else "warning",
+            _these(blind, len(leds), ".peak_nm"),
+            "the camera is blind to its light (quantum efficiency 0)",
+            "Its layer of the picture is black",
+            "Take an LED of a wavelength that the camera sees, or give camera.quantum_efficiency there",
+        )
     seen = [number for number in lit if checkup.in_sight_percent[number] > 0.0]
     if seen:
         share = float(checkup.in_sight_percent[seen].sum())

@@ -77,6 +77,13 @@ def _unlike(design: Design, alike: Mapping[str, Any]) -> Iterator[str]:
         yield "LEDs below"
     if any(led.pattern != "lambertian" or led.tilt_deg != 0.0 for led in lit):
         yield "LEDs that are not Lambertian"
+    if {led.side for led in lit if led.side != "below"} != {"+x", "-x", "+y", "-y"}:
+        yield "LEDs on other than all four sides"
+    thickness = design.waveguide.thickness_mm
+    if any(led.side != "below" and abs(led.z_mm / thickness + 0.5) > _OFF_MIDDLE for led in lit):
+        yield "LEDs far off the middle of the side faces' height"
+    if design.guide().lower:
+        yield "a guide in layers of different index"
     if len({led.coupling for led in lit}) != 1:
         yield "LEDs in air and embedded ones together" if lit else "no LED lit"
     if design.surface.sheet is not None:
@@ -87,7 +94,8 @@ def _unlike(design: Design, alike: Mapping[str, Any]) -> Iterator[str]:
         yield "a housing that reflects"
     # what the light sees, also where the design leaves it out
     told = {"waveguide.refractive_index": design.guide().refractive_index}
-    told["waveguide.thickness_mm"] = design.waveguide.thickness_mm
+    told["waveguide.thickness_mm"] = thickness
+    told["glass.refractive_index"] = design.glass.at(design.light.wavelength_nm).refractive_index
     for name, (low, high) in alike.items():
         room, _, field = name.partition(".")
         value = told[name] if name in told else tables[room][field]
@@ -109,6 +117,7 @@ def _kind(design: Design, data: Mapping[str, Any]) -> dict[str, Any]:
 
 
 _GAP = 0.05  # of the index in the gaps, within which it is the measured one
+_OFF_MIDDLE = 0.2  # of the guide's thickness, from the middle, where LEDs count as those measured
 
 
 def _is(kind: Mapping[str, Any], case: Mapping[str, Any]) -> bool:
