@@ -12,10 +12,14 @@ import pytest
 
 from estimation.scalars import scalars
 from twin import ablation, assessing, assessing_report, learning_curve
-from twin.assess import figures, summed_up
+from twin.assess import assess, figures, summed_up
+from twin.assess import words as words_of
 from twin.assessing_figure import draw
 from twin.assessment import answered, record_of, words
 from twin.complaint import DesignError
+from twin.design import load_design, parse_design
+from twin.estimator import Estimator
+from twin.fields import tables_of
 from twin.report import write_json
 
 RANGES = np.array([[2.0, 13.0], [4.0, 12.0], [40.0, 120.0], [-2.0, 2.0], [-2.0, 2.0]])
@@ -162,6 +166,68 @@ def test_an_answer_that_is_kept_is_not_made_again(tmp_path: Path, monkeypatch: p
     assessing.answer(both)
     row = json.loads(one.place.read_bytes())
     assert row["1"] == {"presence": 0.01} and row["100"] == {"presence": 1.0} and assessing._done(both)
+
+
+@pytest.mark.parametrize(("chi_square", "wider"), [(40.0, 1.0), (96.0, 1.0), (960.0, 10.0)])
+def test_a_fit_that_nothing_rendered_confirms_is_as_wide_as_its_misfit(
+    chi_square: float, wider: float
+) -> None:
+    ranges = np.array([[-1e3, 1e3]] * 5)
+    estimator: Any = SimpleNamespace(
+        prior=SimpleNamespace(ranges=ranges),
+        sight=SimpleNamespace(features=SimpleNamespace(spread=np.ones(96))),
+    )
+    fitted: Any = SimpleNamespace(x=np.arange(7.0), covariance=np.eye(7), chi_square=chi_square)
+    drawn = Estimator.normal(estimator, fitted, 20_000, 0)
+    np.testing.assert_allclose(drawn.var(axis=0), wider, rtol=0.05)
+
+
+def test_words_are_of_the_sizes_that_were_held_out() -> None:
+    """Small inclusions only: nothing of 8 mm and more; none at all: nothing but that."""
+    truth, drawn = inclusions(200)
+    small = truth[:, 0] < 7.0
+    told = figures(summed_up(drawn[small], truth[small]), truth[small], np.tile(SD, (small.sum(), 1)), RANGES)
+    text = words_of({"1": {**told, "presence": {}}}, "models/a")
+    assert "4 mm and more" in text and "8 mm and more" not in text and text.endswith("model: models/a")
+    blanks: Any = SimpleNamespace(blank=np.ones(3, bool), values=[{}] * 3, numbers=np.arange(3))
+    nothing: Any = None
+    found = assess(nothing, nothing, blanks, [0], 0, lambda share: None)
+    assert found == {"samples": 0, "blanks": 3} and words_of(found, "m") == "model: m"
+
+
+@pytest.mark.parametrize(
+    ("changes", "word"),
+    [
+        ({"camera": {"frames": 4}}, "camera.frames: received 4"),
+        ({"camera": {"exposure_ms": 3.5}}, "camera.exposure_ms: received 3.5"),
+        ({"leds": {"z_mm": -4.0}}, "leds.0.z_mm: received -4.0"),
+        ({"specimen": {"modulus_kPa": 6.0}}, None),
+        ({"signal": {"counts": 4.0}}, None),
+    ],
+)
+def test_a_corpus_of_another_sensor_is_refused_by_its_first_difference(
+    changes: dict[str, dict[str, float]], word: str | None
+) -> None:
+    """But for what the model knows to vary, and for what pictures do not depend on."""
+    own, tables = tables_of(load_design("tsis")), tables_of(load_design("tsis"))
+    for room, values in changes.items():
+        for table in tables[room] if room == "leds" else [tables[room]]:
+            table.update(values)
+    design = parse_design(tables)
+    source: Any = SimpleNamespace(
+        design=design, name="c", shape=(492, 768), plan=SimpleNamespace(indentation_mm=(1.0, 2.0))
+    )
+    estimator: Any = SimpleNamespace(
+        card={"design": own, "shape": [492, 768], "indentation_mm": [1.0, 2.0]},
+        chain=SimpleNamespace(design=load_design("tsis")),
+        prior=SimpleNamespace(names=("specimen.modulus_kPa",)),
+    )
+    if word is None:
+        assert assessing.levels_of(source, estimator) == [0, 1]
+        return
+    with pytest.raises(DesignError) as caught:
+        assessing.levels_of(source, estimator)
+    assert word in str(caught.value)
 
 
 def test_information_of_the_scalars_is_that_of_noisy_pictures() -> None:

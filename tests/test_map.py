@@ -166,3 +166,9 @@ def test_bad_input_is_one_line(
     assert cli.main([word.format(**places) for word in arguments]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and all(word in error for word in words), error
+
+
+def test_two_different_values_have_no_line():
+    """A threshold that one inclusion alone passes: no traceback, a reason."""
+    fit, why = mapping.judged(np.array([0.0] * 9 + [5.0]), np.arange(1.0, 11.0))
+    assert fit is None and "two different values" in why

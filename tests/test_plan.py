@@ -93,6 +93,17 @@ def test_the_same_study_makes_the_same_bytes(tmp_path):
         assert a == b != c
 
 
+def test_the_digest_is_of_all_that_decides_the_pictures(tmp_path):
+    """The drawn numbers are the same at another quality; what was kept of its pictures is of no use."""
+    one = frozen(tmp_path, name="one")
+    again, rough = (
+        frozen(tmp_path, name="again"),
+        frozen(tmp_path, name="rough", light="preview", quality="preview"),
+    )
+    assert one.head.samples.sha256 == rough.head.samples.sha256
+    assert one.digest == again.digest != rough.digest
+
+
 @pytest.mark.parametrize("sampler", ["uniform", "sobol", "latin"])
 def test_the_first_samples_of_a_plan_are_those_of_a_smaller_one(tmp_path, sampler):
     whole = frozen(tmp_path, name="whole", sampler=sampler, count=40)

@@ -55,6 +55,24 @@ def test_folders_come_back_as_they_were_written(given, tmp_path):
         assert found.images.dtype == found.references.dtype == np.float32
 
 
+@pytest.mark.parametrize(
+    ("depths", "fits"),
+    [
+        ((1.02, 2.04, 3.06), True),
+        ((1.0, 2.002, 3.0), True),
+        ((1.0, 2.0, 3.03), False),
+        ((1.01, 2.0, 3.0), False),
+    ],
+)
+def test_levels_are_off_alike_or_not_at_all(given, depths, fits, tmp_path):
+    """An estimator knows one factor of all depths; one level alone deeper passes for another inclusion."""
+    folders = write_folders(given, depths, tmp_path)
+    if fits:
+        assert len(receive(folders, wanted(SENSOR)).images) == 3
+    else:
+        assert "within 0.15%" in refused(folders, wanted(SENSOR))
+
+
 def test_averaged_folders_keep_fractions_and_are_averaged_again(tmp_path):
     halves = [pair(SENSOR, seed=seed, frames=4) for seed in (1, 2)]
     for number, half in enumerate(halves):

@@ -4,6 +4,7 @@ import csv
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -12,10 +13,11 @@ import pytest
 from estimation import paper
 from estimation.ann import Settings
 from tests import browser, painted
-from twin import cli, earlier, inversion, replicate, replication, replication_findings
+from twin import cli, earlier, inversion, learned, replicate, replication, replication_findings
 from twin.complaint import DesignError
 from twin.corpus import Corpus
 from twin.inversion import PICTURE, PLAIN, SURFACE, Variant
+from twin.planned import sha256
 
 SHORT = Settings(hidden=(4,), steps=25)
 
@@ -248,3 +250,31 @@ def test_bad_input_is_one_line(
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and all(word in error for word in words), error
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("planned", "emulator", "solve", "word"),
+    [
+        ("tsis", None, True, "--solve: received a corpus planned with an emulator"),
+        ("another", "tsis", False, "--emulator: received a corpus planned with another emulator"),
+        (None, "tsis", False, "--emulator: received a corpus planned without it"),
+        ("tsis", "tsis", False, None),
+        (None, None, True, None),
+    ],
+)
+def test_a_corpus_that_was_made_otherwise_is_not_gone_on_with(
+    tmp_path, monkeypatch, planned, emulator, solve, word
+):
+    shipped = {"tsis": sha256(learned.usual_emulator("tsis")), "another": 64 * "0"}
+    made_by = None if planned is None else SimpleNamespace(sha256=shipped[planned])
+    head = SimpleNamespace(seed=0, emulator=made_by)
+    monkeypatch.setattr(replicate, "load_plan", lambda folder: SimpleNamespace(name="paper", head=head))
+    done = SimpleNamespace(failed=0)
+    monkeypatch.setattr("twin.run.run", lambda *arguments, **options: done)
+    (tmp_path / "plan.json").touch()
+    asked = (tmp_path, "paper", 0, emulator, solve, 1, lambda stage, share: None)
+    if word is None:
+        replicate.simulate(*asked)
+        return
+    with pytest.raises(DesignError, match=word):
+        replicate.simulate(*asked)

@@ -46,6 +46,8 @@ def assess(
     there = np.flatnonzero(~seen.blank)
     truth = np.array([[seen.values[row][name] for name in NAMES] for row in there])
     found: dict[str, Any] = {"samples": len(there), "blanks": int(seen.blank.sum())}
+    if not len(there):
+        return found
     for frames in FRAMES[:1]:  # means of many take minutes: `twin assess`
         pictures = np.stack([stored(estimator, source, int(n), levels) for n in seen.numbers])
         features = estimator.features(pictures)
@@ -176,7 +178,9 @@ def words(metrics: dict[str, Any], model: str) -> str:
         if one is None:
             continue
         for name in ("4 mm and more", "8 mm and more"):
-            part = one[name]
+            part = one.get(name)
+            if part is None:  # none that large was held out
+                continue
             words = ", ".join(
                 f"{short} {part['rmse'][key]:.3g} (bound {part['bound'][key]:.3g})"
                 for short, key in zip(("d", "h", "E"), NAMES, strict=True)

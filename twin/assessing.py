@@ -27,15 +27,18 @@ from twin.complaint import DesignError, shown
 from twin.corpus import Corpus
 from twin.estimates import NAMES
 from twin.estimator import Estimator
-from twin.estimator_file import load_estimator
+from twin.estimator_file import load_estimator, without_luminaires
+from twin.fields import flat, tables_of
 from twin.pooled import each
 from twin.report import write_json
-from twin.train import TEST, level_names
+from twin.train import TEST, level_names, single
 
 SAMPLES, RECORD, PICTURE = "samples", assessing_report.ASSESSMENT, assessing_report.ASSESSED
 KEPT = "curve.parts"
 """What a folder with a learning curve holds."""
 _DRAWS = 4000
+_OPEN = ("name", "description", "mechanics", "press.", "signal.")
+"""Of a design, what may differ from the model's."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +92,7 @@ def assess(
     folder = Path(out)
     told = {
         "model": estimator.card["sha256"],
-        "corpus": source.plan.head.samples.sha256,
+        "corpus": source.plan.digest,
         "seed": seed,
         "format": 1,
     }
@@ -126,7 +129,9 @@ def assess(
 
 
 def levels_of(source: Corpus, estimator: Estimator) -> list[int]:
-    """Numbers of the corpus's press levels that the model wants; raises `DesignError` for other sensors."""
+    """Numbers of the corpus's press levels that the model wants; raises `DesignError` for other sensors, and
+    for pictures that are means of exposures."""
+    single(source)
     design, card = source.design, estimator.card
     names = ("pixels", "LEDs")
     given = (list(source.shape), len(design.leds))
@@ -138,7 +143,21 @@ def levels_of(source: Corpus, estimator: Estimator) -> list[int]:
     if not set(depths) <= set(there):
         allowed = f"levels {depths}, as the model was trained for"
         raise DesignError("indentation_mm", shown(there), allowed, source=source.name)
+    _same_sensor(source, estimator)
     return [there.index(depth) for depth in depths]
+
+
+def _same_sensor(source: Corpus, estimator: Estimator) -> None:
+    """Refuse a sensor that differs from the model's in more than the model knows to vary."""
+    own, other = (
+        flat(without_luminaires(tables)) for tables in (estimator.card["design"], tables_of(source.design))
+    )
+    varied = set(estimator.prior.names)
+    for field in sorted(set(own) | set(other)):
+        if field.startswith(_OPEN) or field in varied or own.get(field) == other.get(field):
+            continue
+        allowed = f"{shown(own.get(field))}, as the model's sensor has"
+        raise DesignError(field, shown(other.get(field)), allowed, source=source.name)
 
 
 def free(folder: Path) -> bool:

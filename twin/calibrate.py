@@ -82,7 +82,7 @@ def calibrate(
     numbers = [int(n) for n in source.samples if source.plan.inclusion(int(n)) is not None][:samples]
     if len(numbers) < LEAST:
         raise DesignError("samples", shown(len(numbers)), f"{LEAST} or more inclusions", source=source.name)
-    made_of = (estimator.card["sha256"], source.plan.head.samples.sha256, versions())
+    made_of = (estimator.card["sha256"], source.plan.digest, versions())
     key = hashlib.sha256(repr(made_of).encode()).hexdigest()
     folder = place.with_name(place.stem + ".parts") / f"rendered-{key[:16]}"
     folder.mkdir(parents=True, exist_ok=True)

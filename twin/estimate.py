@@ -26,6 +26,7 @@ _METHODS = {
     "rendered": "refined by rendering the most probable inclusion",
     "network": "by the network alone",
     "fitted": "by the light that was learned, without rendering: its error is known and small here",
+    "unrendered": "by a fit of the light that was learned alone; nothing rendered confirms it",
 }
 _WORDS = {"size_mm": ("size", "mm"), "depth_mm": ("depth", "mm"), "modulus_kPa": ("modulus", "kPa")}
 

@@ -144,7 +144,9 @@ def add(verbs: Any) -> None:
         help="FRAMEs of each press level, to be averaged (default 1)",
     )
     estimate.add_argument(
-        "--quick", action="store_true", help="the network's answer, without rendering (2 s instead of 20)"
+        "--quick",
+        action="store_true",
+        help="without rendering: by the network, or a fit where MODEL is calibrated (2 s instead of 20)",
     )
     estimate.add_argument("--flip", action="store_true", help="the files are seen from below, mirrored")
     estimate.add_argument("--out", metavar="DIR", help="new folder for estimate.json and overview.png")

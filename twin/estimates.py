@@ -30,7 +30,9 @@ class Estimate:
     predicted : (levels, r, c) the same as expected at the posterior mean.
     noise : (levels, r, c) standard deviation of observed minus predicted, counts.
     method : where the samples come from: "rendered" (`twin.refining`), "fitted" where learned light does as
-        well, or in a calibrated model, whose network does not know of the calibration; else "network".
+        well; where nothing was rendered, or nothing rendered explains the pictures, "network", or in a
+        calibrated model, of whose calibration the network does not know, "unrendered", a fit by learned
+        light.
     misfit : chi-square of the predicted pictures over its number of features; near 1 where the model can make
         these pictures.
     """

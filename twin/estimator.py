@@ -108,7 +108,7 @@ class Estimator:
         if refined is not None and refined.explains:
             method, answer = "rendered" if refined.renders else "fitted", refined.samples
         elif self.calibration is not None:
-            method, answer = "fitted", self.normal(fitted, samples, seed)
+            method, answer = "unrendered", self.normal(fitted, samples, seed)
         wanted = answer[:, : len(NAMES)]
         gain = np.array([self.chain.gain(self.prior.values(fitted.x[: len(self.prior.middle)]))])
         variance = mean_variance(self.chain.design, seen[None], gain, frames)[0]
@@ -139,10 +139,12 @@ class Estimator:
         return presence(self.chain, sight.features, self.prior, told, frames, fitted, off)
 
     def normal(self, fitted: Fitted, samples: int, seed: int) -> NDArray[np.float64]:
-        """Samples (n, 5) about the most probable specimen, within the prior's ranges."""
+        """Samples (n, 5) about the most probable specimen, within the prior's ranges. What the noise does not
+        explain makes them wider."""
         rng = np.random.default_rng([seed, 13])
         low, high = self.prior.ranges.T
-        drawn = rng.multivariate_normal(fitted.x[:5], fitted.covariance[:5, :5], samples)
+        wider = max(1.0, fitted.chi_square / len(self.sight.features.spread))
+        drawn = rng.multivariate_normal(fitted.x[:5], wider * fitted.covariance[:5, :5], samples)
         return np.clip(drawn, low, high)
 
     @property

@@ -188,3 +188,17 @@ def put(tables: Mapping[str, Any], changes: Iterable[tuple[str, float]]) -> dict
         whole = limits(path).get("type") == "integer"
         node[path[-1]] = int(value) if whole else float(value)  # type: ignore[index]
     return changed
+
+
+def flat(value: Any, prefix: str = "") -> dict[str, Any]:
+    """Values of nested tables and lists by their dotted names."""
+    if isinstance(value, dict):
+        items: Any = value.items()
+    elif isinstance(value, list):
+        items = enumerate(value)
+    else:
+        return {prefix: value}
+    found: dict[str, Any] = {}
+    for key, inner in items:
+        found |= flat(inner, f"{prefix}.{key}" if prefix else str(key))
+    return found

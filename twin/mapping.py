@@ -189,6 +189,8 @@ def judged(x: Floats, y: Floats) -> tuple[Adequacy | None, str]:
     for words, values in (("surface", x), ("picture", y)):
         if np.ptp(values) <= 1e-9 * np.abs(values).max():
             return None, f"nothing to fit: the {words}'s scalar is the same for all samples"
+        if len(np.unique(values)) < 3:
+            return None, f"nothing to fit: the {words}'s scalar has two different values only"
     fit = judge_line(x, y)
     return fit, fit.why
 

@@ -14,6 +14,7 @@ from pydantic import TypeAdapter
 
 from twin import mapping_figures as figures
 from twin.design import Design
+from twin.fields import flat
 from twin.mapping import MOST, Mapped, labels, map_corpus, open_corpus
 from twin.mapping_verdict import AtThreshold, area_r2, at_thresholds, headline, verdict
 from twin.report import Page, digits, write_csv, write_json
@@ -87,7 +88,7 @@ def study(
         ks = at_thresholds(swept, columns[0], columns[1], corpus.shape[0] * corpus.shape[1])
         table = corpus.table.iloc[:: corpus.levels]
         depth = dict(zip(table["sample"].tolist(), table["depth_mm"].tolist(), strict=True))
-        lines = verdict(maps, kind, level, ks, swept.noise_dn, corpus.design.signal.counts)
+        lines = verdict(maps, kind, level, [] if raw else ks, swept.noise_dn, corpus.design.signal.counts)
         found.append(One(label, corpus, maps, kind, level, swept, ks, area_r2(swept), depth, lines))
     return found
 
@@ -106,7 +107,7 @@ def _tell_part(tell: Callable[[str, float], None], part: int, parts: int, done: 
 
 def differences(corpora: Sequence[Corpus]) -> list[list[str]]:
     """Return the fields of the designs that are not the same: name, and the value in each corpus."""
-    flat = [_flat(TypeAdapter(Design).dump_python(corpus.design, mode="json")) for corpus in corpora]
+    flat = [flat(TypeAdapter(Design).dump_python(corpus.design, mode="json")) for corpus in corpora]
     rest: list[dict[str, Any]] = [
         {"mechanics of the plan": c.plan.mechanics, "quality": c.plan.quality, "light": c.plan.light}
         for c in corpora
@@ -239,7 +240,7 @@ def _corpus(made: Page, one: One, prefix: str) -> None:
     made.section(f"{prefix}Threshold k")
     made.figure(
         figures.thresholds(one),
-        f"Maximum and area taken again from the stored pictures at other thresholds, {one.level_mm:g} mm. "
+        f"Maximum and area of tared pictures, taken again at other thresholds, {one.level_mm:g} mm. "
         f"Noise of a "
         f"pixel of the tared picture: {one.swept.noise_dn:.2f} counts; left of the dotted line (5 times "
         f"that) noise "
@@ -372,16 +373,3 @@ def _side_by_side(found: Sequence[One]) -> tuple[list[str], list[list[str]], str
                 ]
             )
     return head, rows, f"The lines of the {found[0].kind} scalars."
-
-
-def _flat(value: Any, prefix: str = "") -> dict[str, Any]:
-    if isinstance(value, dict):
-        items: Any = value.items()
-    elif isinstance(value, list):
-        items = enumerate(value)
-    else:
-        return {prefix: value}
-    found: dict[str, Any] = {}
-    for key, inner in items:
-        found |= _flat(inner, f"{prefix}.{key}" if prefix else str(key))
-    return found

@@ -178,6 +178,11 @@ class Plan:
         return self.head.light_seed
 
     @property
+    def digest(self) -> str:
+        """Hash of plan.json: of all that decides the pictures, not of the drawn numbers alone."""
+        return sha256(self.folder / PLAN)
+
+    @property
     def shares_references(self) -> bool:
         """Whether pictures without inclusion are the same for all samples.
 

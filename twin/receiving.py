@@ -26,8 +26,9 @@ from twin.sound import check_exposure, check_pair, check_same
 
 Float = NDArray[np.float32]
 
-_OFF = 0.03
-"""Share of a press level that a simulated frame's may be off: no more than an estimator allows for."""
+_OFF, _APART = 0.03, 0.0015
+"""Share of a press level that simulated frames' may be off, all of them alike, as an estimator allows for;
+and that one may be off beyond the others, which it takes for a softer inclusion (1 %: E is 4 sd off)."""
 _MOST_RECORD = 2**20  # bytes
 _SIMULATED = "folder of twin simulate"
 
@@ -169,7 +170,7 @@ def _opened(folders: list[Path]) -> list[Path]:
 def _from_folders(folders: list[Path], wanted: Wanted, exposures: int) -> Received:
     _check_count(len(folders), wanted, exposures, "FRAME", "frames")
     by_level: list[list[tuple[Path, dict[str, Any]]]] = [[] for _ in range(wanted.levels)]
-    depths = np.array(wanted.indentation_mm)
+    depths, off = np.array(wanted.indentation_mm), list[float]()
     for folder in folders:
         record = _record(folder)
         depth = _number(record, "press", "indentation_mm", folder)
@@ -178,6 +179,11 @@ def _from_folders(folders: list[Path], wanted: Wanted, exposures: int) -> Receiv
             allowed = f"{', '.join(f'{value:g}' for value in depths)} mm, the levels of the model"
             raise DesignError(f"{folder}: press.indentation_mm", f"{depth:g}", allowed)
         by_level[level].append((folder, record))
+        off.append(depth / depths[level] - 1.0)
+        if max(off) - min(off) > _APART:
+            allowed = f"levels that are off alike, within {_APART:.2%} (another: {off[0]:+.2%})"
+            received = f"{depth:g}, {off[-1]:+.2%} off its level"
+            raise DesignError(f"{folder}: press.indentation_mm", received, allowed)
     for depth, group in zip(depths, by_level, strict=True):
         if len(group) != exposures:
             raise DesignError("FRAME", f"{len(group)} at {depth:g} mm", f"{exposures} at each press level")

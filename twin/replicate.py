@@ -10,7 +10,7 @@ from pathlib import Path
 
 from twin import learned
 from twin.complaint import DesignError, shown
-from twin.planned import PLAN, load_plan
+from twin.planned import PLAN, load_plan, sha256
 from twin.stage import staged
 
 CORPUS = "corpus"
@@ -93,9 +93,13 @@ def simulate(
             raise DesignError(
                 "out", received, f"{study} of seed {seed}, or another folder", source=str(folder)
             )
-        if emulator is not None and plan.mechanics != "emulator":
+        planned = None if plan.head.emulator is None else plan.head.emulator.sha256
+        if emulator is not None and (planned is None or file is None or sha256(file) != planned):
+            there = "without it" if planned is None else "with another emulator"
+            raise DesignError("--emulator", f"a corpus planned {there}", "another folder", source=str(folder))
+        if solve and planned is not None:
             raise DesignError(
-                "--emulator", "a corpus planned without it", "another folder", source=str(folder)
+                "--solve", "a corpus planned with an emulator", "another folder", source=str(folder)
             )
     else:
         plan = freeze(

@@ -158,8 +158,7 @@ def train(
         chain, features, inputs, many, ranges, error, seed, lambda s: tell("noise", 0.4 + 0.1 * s)
     )
     key = hashlib.sha256(
-        repr((plan.head.samples.sha256, chosen, seed, imagined, samples, versions())).encode()
-        + told.present.tobytes()
+        repr((plan.digest, chosen, seed, imagined, samples, versions())).encode() + told.present.tobytes()
     ).hexdigest()[:16]
     network = _network(told, parts / f"{key}.safetensors", minutes, seed, tell)
     estimator = Estimator(
@@ -200,6 +199,7 @@ def train(
 
 def of_levels(source: Corpus, levels: Sequence[int] | None) -> Design:
     design = source.plan.base
+    single(source)
     if design.camera.colour != "mono":
         raise DesignError("camera.colour", shown(design.camera.colour), '"mono"', source=source.name)
     if levels is None:
@@ -210,6 +210,15 @@ def of_levels(source: Corpus, levels: Sequence[int] | None) -> Design:
             raise DesignError("levels", shown(level), allowed, source=source.name)
     depths = tuple(design.press.indentation_mm[level] for level in levels)
     return replace(design, press=replace(design.press, indentation_mm=depths))
+
+
+def single(source: Corpus) -> None:
+    """Refuse a corpus whose pictures are means of exposures: estimators learn from single ones, and take
+    means of these."""
+    frames = source.design.camera.frames
+    if frames != 1:
+        allowed = "1: estimators learn from single exposures"
+        raise DesignError("camera.frames", shown(frames), allowed, source=source.name)
 
 
 def level_names(values: dict[str, float], levels: Sequence[int]) -> dict[str, float]:
@@ -236,7 +245,7 @@ def _range(plan: Any, name: str) -> tuple[float, float]:
 def gather(source: Corpus, emulator: fem.Emulator, parts: Path, tell: Callable[[float], None]) -> Seen:
     """Return a corpus's samples; what was read before is kept in the folder ``parts``."""
     plan, base = source.plan, source.plan.base
-    kept = parts / f"pictures-{plan.head.samples.sha256[:16]}.npz"
+    kept = parts / f"pictures-{plan.digest[:16]}.npz"
     old: dict[int, tuple[Single, Single]] = {}
     if kept.is_file():
         with np.load(kept, allow_pickle=False) as file:
