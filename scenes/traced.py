@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from . import kriging
+from . import ies, kriging
 from .sensor import NotModelled, Sensor
 from .surface import OpticalSurface
 
@@ -110,7 +110,7 @@ class TracedLight:
 def optics_key(sensor: Sensor) -> str:
     """Return a hash of all that traced light depends on, but for the press: not the camera, the LEDs' power
     and what the contact fraction says."""
-    leds = tuple(replace(led, flux_W=1.0) for led in sensor.leds)
+    leds = tuple(replace(led, flux_W=1.0, ies=None) for led in sensor.leds)
     skin = replace(sensor.skin, rms_slope=1.0, kappa=1.0)
     told: tuple[object, ...] = (
         LIGHT,
@@ -122,6 +122,7 @@ def optics_key(sensor: Sensor) -> str:
         sensor.wavelength_nm,
     )
     told += (sensor.guide.lower,) if sensor.guide.lower else ()
+    told += tuple(ies.digest(led.ies) for led in sensor.leds if led.ies is not None)
     return hashlib.sha256(repr(told).encode()).hexdigest()[:16]
 
 
@@ -170,7 +171,9 @@ def learn(
     mean = np.zeros((*traced[0].shape[:2], fine, fine))
     coarse = np.empty((n, *traced[0].shape[:2], _COARSE, _COARSE), np.float32)
     for number, maps in enumerate(traced):
-        per_watt = np.asarray(maps, np.float64) / flux
+        # an LED that is dark in this band, its light being in another, stands in the way here all the same
+        whole = np.asarray(maps, np.float64)
+        per_watt = np.divide(whole, flux, out=np.zeros_like(whole), where=flux > 0.0)
         mean += blocks(per_watt, fine) / n
         coarse[number] = blocks(per_watt, _COARSE)
     lengths, noise = kriging.lengths(x @ axes, _leading(coarse))

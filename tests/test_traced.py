@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from test_forward import pressing
+from test_lamp import file_of
 from test_simulate import small
 
 import fem
@@ -70,6 +71,39 @@ def test_light_follows_the_leds_power(learned, sensor):
     )
     before, after = (learned.at(one, surface, fraction) for one in (sensor, twice))
     assert np.allclose(after[0], 2 * before[0]) and np.allclose(after[1:], before[1:])
+
+
+def test_an_led_that_is_dark_in_this_band_is_learned_as_dark(sensor):
+    """Its light is in another band, but it stands in the way of the others' here, too."""
+    dark = replace(sensor, leds=(replace(sensor.leds[0], flux_W=0.0), *sensor.leds[1:]))
+    surfaces, fractions, light = presses(60, 0)
+    lit = [np.concatenate([0.0 * maps[:1], maps[1:]]) for maps in light]
+    found = traced.learn(
+        dark, [traced.describe(*one) for one in zip(surfaces, fractions, strict=True)], lit
+    ).at(dark, surfaces[0], fractions[0])
+    assert np.isfinite(found).all() and not found[0].any() and found[1:].min() > 0.0
+
+
+def test_a_failed_led_is_refused_before_anything_is_traced(tmp_path):
+    design = small()
+    failed = replace(design, leds=(replace(design.leds[0], flux_W=0.0), *design.leds[1:]))
+    with pytest.raises(DesignError, match=r"leds\.0\.flux_W: received 0"):
+        learn_light.learn_light(failed, str(tmp_path / "a.npz"))
+    assert not list(tmp_path.iterdir())
+
+
+def test_light_belongs_to_what_a_luminaire_file_says_wherever_it_lies(sensor, tmp_path):
+    def key(name: str) -> str:
+        led = replace(sensor.leds[0], pattern="ies", ies=str(tmp_path / name))
+        return traced.optics_key(replace(sensor, leds=(led,)))
+
+    angles = np.array([0.0, 45.0, 90.0])
+    (tmp_path / "a.ies").write_text(file_of(angles, np.zeros(1), np.array([100.0, 70.0, 0.0])))
+    (tmp_path / "b.ies").write_bytes((tmp_path / "a.ies").read_bytes())
+    before = key("a.ies")
+    assert key("b.ies") == before
+    (tmp_path / "a.ies").write_text(file_of(angles, np.zeros(1), np.array([100.0, 5.0, 0.0])))
+    assert key("a.ies") != before
 
 
 def test_light_of_another_sensor_is_refused(learned, sensor):

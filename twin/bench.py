@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import fem
+from scenes import ies
 from scenes.traced import LIGHT
 from scenes.view import SIGHT
 from twin import coarse as pixels
@@ -66,7 +67,8 @@ def optical_key(design: Design) -> tuple[Any, ...]:
     sensor = design.sensor()
     parts = sensor.guide, sensor.glass, sensor.leds, sensor.skin, sensor.tissue, sensor.effective_modulus_kPa
     box = (design.housing,) if design.housing.reflects else ()
-    return (*seen, camera.colour, response, camera.pixel_um, design.light, *parts, *box)
+    luminaires = [ies.digest(led.ies) for led in sensor.leds if led.ies is not None]
+    return (*seen, camera.colour, response, camera.pixel_um, design.light, *parts, *box, *luminaires)
 
 
 @dataclass

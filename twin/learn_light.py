@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.stats import qmc
 
 import fem
+from scenes import ies
 from twin import learned, presses
 from twin.complaint import DesignError, shown
 from twin.conflicts import black, colourless
@@ -78,6 +79,10 @@ def learn_light(
     target = check_file(out, "out", ".npz")
     colourless(design, "learned light")
     black(design, "learned light")
+    for number, led in enumerate(design.leds):
+        if led.flux_W == 0.0:
+            allowed = "more than 0: light is learned for each watt"
+            raise DesignError(f"leds.{number}.flux_W", shown(led.flux_W), allowed, source=design.name)
     if samples < 64:
         raise DesignError("samples", shown(samples), "64 or more")
     file = learned.usual_emulator(design.name) if emulator is None else learned.emulator_file(emulator)
@@ -200,7 +205,8 @@ def _mark(task: Task) -> str:
     """What decides a press's light: files of another design or an earlier version are traced anew."""
     from scenes.traced import LIGHT
 
-    told = (LIGHT, task.design, task.inclusion, task.depth_mm, task.seed)
+    luminaires = tuple(ies.digest(led.ies) for led in task.design.leds if led.ies is not None)
+    told = (LIGHT, task.design, task.inclusion, task.depth_mm, task.seed, *luminaires)
     return hashlib.sha256(repr(told).encode()).hexdigest()[:16]
 
 
