@@ -135,5 +135,5 @@ def saturated_percent(design: Design, image: np.ndarray, radiance: np.ndarray) -
 
 
 def _random(seed: int, *purpose: int) -> np.random.SeedSequence:
-    """Return the child of the seed for one purpose, and for one press level where it is named (µm or µN)."""
+    """Return the child of the seed for one purpose, and for one press level where it is named (nm or µN)."""
     return np.random.SeedSequence(seed, spawn_key=purpose)
