@@ -67,5 +67,5 @@ $(BIN)/pip:
 	  echo "Python cannot make an environment here: sudo apt-get install python3-venv" >&2; exit 1; }
 
 clean:
-	rm -rf .venv .llvm .ccx .chromium build dist out *.egg-info .pytest_cache .mypy_cache .ruff_cache
+	rm -rf .venv .llvm .ccx .chromium build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

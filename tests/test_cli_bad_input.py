@@ -51,6 +51,8 @@ FLAGS = {
         ["--quality", "'best'", "preview, standard, reference"],
     ),
     "unknown device": ([*FINE, "--device", "tpu"], ["--device", "'tpu'", "auto, cpu, cuda"]),
+    "noise next to nothing": ([*FINE, "--noise", "1e-300"], ["--noise", "'1e-300'", ">= 0.001"]),
+    "a design without end": (["simulate", "/dev/zero", *FINE[1:]], ["/dev/zero", "more than 1000000 bytes"]),
     "seed is not whole": ([*FINE, "--seed", "1.5"], ["--seed", "'1.5'", "an integer"]),
     "negative seed": ([*FINE, "--seed", "-1"], ["--seed", "'-1'", "an integer"]),
     "touches the chest wall": ([*FINE, "--depth", "20"], ["--depth", "20.0", "30 mm", "chest wall"]),

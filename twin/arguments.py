@@ -11,7 +11,7 @@ from typing import Any, NoReturn
 
 from twin.complaint import shown
 from twin.presses import Mechanics, Quality
-from twin.simulation import Device
+from twin.simulation import LEAST_NOISE, Device
 
 QUALITIES = Quality.__args__  # type: ignore[attr-defined]
 MECHANICS = Mechanics.__args__  # type: ignore[attr-defined]
@@ -34,7 +34,7 @@ examples:
   twin simulate tsis --size 8 --depth 5 --modulus 120 --indentation 1 2 3 --seed 7 --out levels
   twin simulate tsis --size 10 --depth 5 --modulus 100 --offset 3 0 --tilt 0 2 --out tilted
   twin simulate my-sensor.toml --no-inclusion --force 0.5 --mechanics linear --out flat
-  twin simulate --size 9 --depth 6 --modulus 80 --mechanics emulator --emulator tsis.npz --out quick
+  twin simulate --size 9 --depth 6 --modulus 80 --mechanics emulator --emulator tsis --out quick
 """
 
 _CHECK = """\
@@ -267,7 +267,7 @@ def _add_run_flags(parser: Parser, out: str | None = None) -> None:
     _add_quality_flag(parser, "; reference follows every ray: many minutes")
     parser.add_argument(
         "--noise",
-        type=number(above=0.0),
+        type=number(least=LEAST_NOISE),
         metavar="PERCENT",
         help="compute light until its noise (rms of a pixel, of the mean) is there (default: the quality's)",
     )
@@ -287,16 +287,17 @@ def _add_light_flags(parser: Parser) -> None:
     )
 
 
-def number(*, above: float = -math.inf) -> Callable[[str], float]:
+def number(*, above: float = -math.inf, least: float = -math.inf) -> Callable[[str], float]:
     """Return a reader of finite numbers, for argparse."""
     allowed = "a finite number" if above == -math.inf else f"a finite number > {above:g}"
+    allowed += "" if least == -math.inf else f" >= {least:g}"
 
     def read(text: str) -> float:
         try:
             value = float(text)
         except ValueError:
             value = math.nan
-        if not above < value < math.inf:
+        if not (above < value < math.inf and value >= least):
             raise argparse.ArgumentTypeError(f"received {shown(text)}; allowed {allowed}")
         return value
 

@@ -28,6 +28,7 @@ from scenes.sensor import Camera, Glass, Guide, Housing, Led, Sensor
 from scenes.skin import Absorption, Anisotropy, Colour, RefractiveIndex, Scattering, Skin, Tissue
 from twin.complaint import DesignError, from_validation, not_finite, shown
 from twin.conflicts import design_conflicts, inclusion_conflicts
+from twin.texts import read_text
 from twin.waveguide import CONFIG, Waveguide
 
 MAX_STRAIN = 0.2
@@ -37,6 +38,7 @@ independent code."""
 MIN_INDENTATION_MM = 1e-4
 """Smallest press: far below what any camera sees."""
 
+_MAX_BYTES = 1_000_000  # of a design's file
 _ONE_LINE = r"^[^\x00-\x1f\x7f-\x9f]*$"
 
 Depth = Annotated[float, Field(ge=MIN_INDENTATION_MM, le=100.0)]
@@ -340,9 +342,9 @@ def _read(name_or_path: str | Path) -> str:
     if not source:
         raise DesignError("DESIGN", "an empty name", "a shipped design or a TOML file")
     try:
-        return _place(name_or_path).read_text(encoding="utf-8-sig")  # Windows editors put a mark first
-    except UnicodeDecodeError:
-        raise DesignError("the file", "bytes that are not UTF-8 text", "a TOML file", source=source) from None
+        return read_text(_place(name_or_path), _MAX_BYTES, source)
+    except DesignError:
+        raise
     except IsADirectoryError:
         raise DesignError("DESIGN", f"the directory {shown(source)}", "a TOML file") from None
     except (OSError, ValueError):

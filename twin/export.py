@@ -12,7 +12,7 @@ from twin import presses
 from twin.complaint import DesignError, shown
 from twin.design import Design
 from twin.presses import Quality
-from twin.stage import check_file, staged, staged_file
+from twin.stage import begins, check_file, staged, staged_file
 
 Kind = Literal["vtu"]
 
@@ -140,4 +140,5 @@ def export_decks(
 
 def _holds_decks(folder: Path) -> bool:
     """Only what this writes, so that no answer of CalculiX is ever lost."""
-    return {entry.name for entry in folder.iterdir()} <= {*_DECKS, "README.txt"}
+    names = {entry.name for entry in folder.iterdir()}
+    return names <= {*_DECKS, "README.txt"} and begins(folder / "README.txt", README)

@@ -12,7 +12,7 @@ from twin.complaint import DesignError, shown
 from twin.conflicts import colourless
 from twin.design import Design
 from twin.presses import Quality
-from twin.stage import staged
+from twin.stage import begins, staged
 
 if TYPE_CHECKING:
     from scenes.surface import OpticalSurface
@@ -163,7 +163,13 @@ def _is_ours(kind: Kind) -> Callable[[Path], bool]:
     names = {"scene.xml", "contact.ply", "contact.npy"}
     if kind != "mitsuba":
         names = {f"{body}.{kind}" for body in _BODIES}
-    return lambda folder: {entry.name for entry in folder.iterdir()} <= names | {_README}
+    told = _MITSUBA_README if kind == "mitsuba" else _MESH_README
+
+    def ours(folder: Path) -> bool:
+        there = {entry.name for entry in folder.iterdir()}
+        return there <= names | {_README} and begins(folder / _README, told)
+
+    return ours
 
 
 def _in_words(inclusion: fem.Inclusion | None) -> str:

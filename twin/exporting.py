@@ -11,6 +11,7 @@ import csv
 import io
 import json
 import math
+import re
 import tarfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -28,7 +29,7 @@ from scenes import png
 from scenes.camera import count_dtype
 from twin.complaint import DesignError, shown
 from twin.corpus import Corpus
-from twin.stage import staged
+from twin.stage import has_keys, staged
 
 Kind = Literal["webdataset", "hf", "png"]
 KINDS = ("webdataset", "hf", "png")
@@ -343,7 +344,16 @@ def _is_export(folder: Path) -> bool:
     """Whether a folder holds an earlier export and nothing else."""
     names = {entry.name for entry in folder.iterdir()}
     known = {NOTE, "README.md", "data", "metadata.csv", "metadata.jsonl", *_PICTURE_COLUMNS}
-    return NOTE in names and all(name in known or _is_shard(name) for name in names)
+    inside = (entry for name in ("data", *_PICTURE_COLUMNS) for entry in (folder / name).glob("*"))
+    return (
+        has_keys(folder / NOTE, "tared_png_scale", "plan")
+        and all(name in known or _is_shard(name) for name in names)
+        and all(_INSIDE.fullmatch(entry.name) for entry in inside)
+    )
+
+
+_INSIDE = re.compile(r"train-[0-9]{5}-of-[0-9]{5}\.parquet|[0-9]{6,}(_[0-9]+)?\.png")
+"""What lies in an export's folders."""
 
 
 def _is_shard(name: str) -> bool:

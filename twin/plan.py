@@ -38,7 +38,7 @@ from twin.planned import (
 )
 from twin.sample_table import MAX_NUMBERS, write_samples
 from twin.settling import Columns, Drawn, Setting, drawn
-from twin.stage import staged
+from twin.stage import has_keys, staged
 from twin.study import MAX_COUNT, PARAMETERS, CorpusMechanics, Distribution, Source, load_study
 
 if TYPE_CHECKING:
@@ -152,7 +152,7 @@ def holds_plan(folder: Path) -> bool:
     """Return whether a folder holds a plan that nothing was run of, and nothing else."""
     names = {entry.name for entry in folder.iterdir()}
     rest = {name for name in names if not IES.fullmatch(name)}
-    return PLAN in rest and rest <= {PLAN, SAMPLES, EMULATOR, TRACED}
+    return rest <= {PLAN, SAMPLES, EMULATOR, TRACED} and has_keys(folder / PLAN, "format", "design_sha256")
 
 
 def _design(source: Source) -> Design:

@@ -33,6 +33,9 @@ if TYPE_CHECKING:
     from scenes import Rendering, SpectralRenderer
     from scenes.traced import TracedLight
 
+LEAST_NOISE = 1e-3
+"""Least noise of light that may be asked for, per cent: a million times the time of 1 %."""
+
 Device = Literal["auto", "cpu", "cuda"]
 Progress = Callable[[str, float], None]
 """Called with the name of the stage that runs now and the share of all work that is done, 0 to 1."""
@@ -151,8 +154,8 @@ def simulate(
     levels, by_force, several = presses.levels_of(design, indentation, force)
     check(design, inclusion, levels, by_force=by_force)
     seed = _seed(seed)
-    if noise is not None and not 0.0 < noise < float("inf"):
-        raise DesignError("noise", shown(noise), "a number > 0, per cent")
+    if noise is not None and not LEAST_NOISE <= noise < float("inf"):
+        raise DesignError("noise", shown(noise), f"a number >= {LEAST_NOISE:g}, per cent")
     coloured = design.specimen.inclusion is not None
     if coloured and quality != "reference":
         colourless(design, f"{quality} quality")

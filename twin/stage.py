@@ -7,6 +7,7 @@ Ctrl-C leaves neither half a result nor a broken earlier one.
 from __future__ import annotations
 
 import glob
+import json
 import os
 import shutil
 from collections.abc import Callable, Iterator
@@ -84,11 +85,33 @@ def check_file(name: str, field: str, suffix: str) -> Path:
     return target
 
 
+def has_keys(place: Path, *keys: str) -> bool:
+    """Whether a file is a table in JSON with these keys: the name alone does not make it ours."""
+    try:
+        found = json.loads(place.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(found, dict) and all(key in found for key in keys)
+
+
+def begins(place: Path, text: str) -> bool:
+    """Whether a file begins with the first words of a text of ours, up to what differs from file to file."""
+    first = text.split("\n", 1)[0].split("{", 1)[0].encode()
+    try:
+        with open(place, "rb") as file:
+            return file.read(len(first)) == first
+    except OSError:
+        return False
+
+
 def _refuse_foreign(out: str | Path, target: Path, is_ours: Callable[[Path], bool]) -> None:
     allowed = "a new or empty folder, or one that holds an earlier result of twin and nothing else"
     try:
         if target.is_symlink() or (target.exists() and not target.is_dir()):
             raise DesignError("out", f"{shown(str(out))}, which is not a folder", allowed)
+        if target.is_dir() and (os.path.ismount(target) or target.samefile(os.curdir)):
+            what = "where a file system is mounted" if os.path.ismount(target) else "the working directory"
+            raise DesignError("out", f"{shown(str(out))}, {what}", "a folder inside it")
         foreign = target.is_dir() and any(target.iterdir()) and not is_ours(target)
     except OSError as error:
         raise DesignError("out", shown(str(out)), f"a folder that can be read ({_reason(error)})") from None

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from twin.complaint import DesignError, shown
+from twin.texts import read_text
 
 MAX_TEXT = 1_000_000
 """Longest study file, characters."""
@@ -35,11 +36,9 @@ def read_study(name: str, kind: str) -> tuple[str, Path]:
         place = Path(str(files("assets").joinpath("studies", f"{name}.toml")))
     allowed = f"a shipped study ({', '.join(shipped_studies(kind))}) or a TOML file that can be read"
     try:
-        if not name or not place.is_file() or place.stat().st_size > MAX_TEXT:
-            raise DesignError("STUDY", shown(name), f"{allowed}, at most {MAX_TEXT} bytes")
-        return place.read_text(encoding="utf-8-sig"), place.parent
-    except UnicodeDecodeError:
-        raise DesignError("the file", "bytes that are not UTF-8 text", "a TOML file", source=name) from None
+        if not name or not place.is_file():
+            raise DesignError("STUDY", shown(name), allowed)
+        return read_text(place, MAX_TEXT, name), place.parent
     except DesignError:
         raise
     except (OSError, ValueError):

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from twin.complaint import DesignError, shown
 from twin.fields import number_at, path_of
 from twin.study import MAX_COUNT, PARAMETERS, check_parameter
+from twin.texts import read_text
 
 _MAX_BYTES = 2**30
 _MAX_COLUMNS = 1000
@@ -42,9 +43,8 @@ def read_table(place: Path, tables: Mapping[str, Any]) -> dict[str, NDArray[Any]
         In one line: file, line and column, what was received and what is allowed.
     """
     try:
-        if place.stat().st_size > _MAX_BYTES:
-            raise DesignError("the file", f"{place.stat().st_size} bytes", f"at most {_MAX_BYTES}")
-        rows = csv.reader(io.StringIO(place.read_text(encoding="utf-8-sig"), newline=""), strict=True)
+        text = read_text(place, _MAX_BYTES, str(place), "a CSV file")
+        rows = csv.reader(io.StringIO(text, newline=""), strict=True)
         header = [name.strip() for name in next(rows, [])]
         defaults = _defaults(header, tables)
         columns: dict[str, list[float]] = {name: [] for name in (*PARAMETERS, *defaults)}
