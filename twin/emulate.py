@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import fem
+from fem.emulator_errors import LARGE, Errors
+from twin.captions import percent_in_words
 from twin.complaint import DesignError, shown
 from twin.design import Design
 from twin.stage import check_file
@@ -102,15 +104,10 @@ def summary(emulator: fem.Emulator, out: str) -> str:
         f"emulator: {emulator.plan.mechanics} mechanics, presses of {low:g} to {high:g} mm, "
         f"{len(errors.size_mm)} samples held out in turn"
     )
-    for what, size in (("inclusions of 4 mm and more", 4.0), ("smaller ones", 0.0)):
-        for name in ("pressure", "displacement"):
-            typical, bad = (errors.percentile(name, percent, size) for percent in (50, 95))
-            lines.append(
-                f"tared {name}, {what}: largest error off the edge {typical:.2g} % of its maximum (median of "
-                f"held-out samples), {bad:.2g} % (95th percentile)"
-            )
-        typical, bad = (errors.percentile("pressure", percent, size, 2) for percent in (50, 95))
-        lines.append(f"tared pressure, {what}: on the whole surface {typical:.2g} % and {bad:.2g} %")
+    smallest = emulator.plan.ranges.size_mm[0]
+    lines += _errors(errors, "inclusions of 4 mm and more", max(smallest, LARGE))
+    if smallest < LARGE:
+        lines += _errors(errors, "smaller ones", smallest)
     for count, more, seconds, median, bad, *_ in errors.curve:
         solves = f"{count:.0f} samples" + (f" ({more:.0f} at finite strain)" if more else "")
         lines.append(
@@ -120,3 +117,21 @@ def summary(emulator: fem.Emulator, out: str) -> str:
     lines.append(f"solves that failed: {failed} of {int(errors.solves[:, 0].sum())}")
     lines.append(f"file: {Path(out)}")
     return "\n".join(lines)
+
+
+def _errors(errors: Errors, what: str, size: float) -> Iterator[str]:
+    """Yield what held-out samples say of inclusions of a size and alike."""
+    of = errors.size_mm[errors.alike(size)]
+    if not of.size:
+        yield f"tared pressure and displacement, {what}: errors not known, too few samples were held out"
+        return
+    if ((of >= LARGE) != (size >= LARGE)).any():  # too few of its kind
+        what += f", by the nearest samples of {of.min():.2g} to {of.max():.2g} mm"
+    for name in ("pressure", "displacement"):
+        typical, bad = (percent_in_words(errors.percentile(name, percent, size)) for percent in (50, 95))
+        yield (
+            f"tared {name}, {what}: largest error off the edge {typical} of its maximum (median of "
+            f"held-out samples), {bad} (95th percentile)"
+        )
+    typical, bad = (percent_in_words(errors.percentile("pressure", percent, size, 2)) for percent in (50, 95))
+    yield f"tared pressure, {what}: on the whole surface {typical} and {bad}"

@@ -104,8 +104,13 @@ def mechanics_facts(design: Design, press: Press | Emulated) -> dict[str, Any]:
         "path": press.path,
         "mechanics": "emulator" if emulated else press.mechanics,
         **({"emulated": press.mechanics} if emulated else {}),
-        "error_percent": press.error_percent,
+        "error_percent": _known(press.error_percent),
     }
+
+
+def _known(percent: float | None) -> float | None:
+    """A number that JSON can hold, or None."""
+    return percent if percent is not None and np.isfinite(percent) else None
 
 
 def picture_facts(
