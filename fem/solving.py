@@ -18,14 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fem.model import NotConverged, NotModelled
-from fem.sampling import PLAN, Plan, background, refine, solve, stretch
+from fem.sampling import PLAN, NotBuilt, Plan, background, refine, solve, stretch
 
 Floats = NDArray[np.float64]
 Progress = Callable[[str, float], None]
-
-
-class NotBuilt(ValueError):
-    """An emulator that cannot be built from what there is: one line says why."""
 
 
 _FORMAT = 3  # of the files in a folder

@@ -3,6 +3,7 @@
 import dataclasses
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import fem
@@ -47,6 +48,26 @@ def test_designs_that_are_not_straight_are_refused() -> None:
             emulate.plan_of(changed)
 
 
+def test_specimens_too_thin_for_inclusions_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`twin emulate` looked for one that fits for ever."""
+    monkeypatch.chdir(tmp_path)
+    design = load_design("tsis")
+    press, slab = dataclasses.replace(design.press, indentation_mm=(1.0,)), design.specimen
+    thin, thick = (
+        dataclasses.replace(design, press=press, specimen=dataclasses.replace(slab, thickness_mm=t))
+        for t in (6.0, 8.3)
+    )
+    monkeypatch.setattr("twin.cli.load_design", lambda name: thin)
+    assert main(["emulate", "thin", "--out", "thin.npz"]) == 2
+    error = capsys.readouterr().err
+    assert "specimen.thickness_mm: received 6.0; allowed at least 8.3 mm" in error and error.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+    plan = emulate.plan_of(thick)
+    assert plan.inside(np.array([plan.point(k) for k in (0, 29)])).shape == (2,)
+
+
 @pytest.mark.parametrize(
     ("flags", "line"),
     [
@@ -54,6 +75,7 @@ def test_designs_that_are_not_straight_are_refused() -> None:
         (["--out", "a.txt"], "out: received 'a.txt'"),
         (["--out", "a.npz", "--workers", "0"], "--workers: received 0"),
         (["--out", "a.npz", "--minutes", "-1"], "--minutes: received '-1'"),
+        (["--out", "a.npz", "--samples", "29"], "samples: received 29; allowed 30 and more"),
     ],
 )
 def test_mistakes_are_one_line(
@@ -74,7 +96,7 @@ def test_mistakes_are_one_line(
 def test_builds_and_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Too few samples end in one line and are kept; the same command with more of them writes the file."""
+    """The same command with more samples solves those that are new, and writes the file."""
 
     def small(design: object, seed: int = 0) -> Plan:
         ranges = Ranges(
@@ -90,11 +112,14 @@ def test_builds_and_goes_on(
     monkeypatch.setattr(emulate, "plan_of", small)
     out = tmp_path / "small.npz"
     command = ["emulate", "tsis", "--workers", "2", "--out", str(out), "--samples"]
-    assert main([*command, "16"]) == 2
-    assert "samples: received 16 samples that were solved" in capsys.readouterr().err
-    kept = {place.name for place in (tmp_path / "small.npz.samples").iterdir()}
-    assert "sample-00015.npz" in kept and not out.exists()
+    assert main([*command, "30"]) == 0
+    folder = tmp_path / "small.npz.samples"
+    kept = {place: place.stat().st_mtime_ns for place in folder.iterdir()}
+    assert folder / "sample-00029.npz" in kept
+    out.unlink()
     assert main([*command, "32"]) == 0
+    assert (folder / "sample-00031.npz").exists()
+    assert {place: place.stat().st_mtime_ns for place in kept} == kept
     said = capsys.readouterr().out
     assert "emulator: " in said and "tared pressure, inclusions of 4 mm and more" in said
     built = fem.load_emulator(out)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,13 +24,18 @@ FINITE = 0.5
 `tsis`. Beyond, the probe's soft corners fold over inclusions under them."""
 
 
+_ROOM = 1.1
+"""How much thicker the thickest specimens are than what holds the smallest and shallowest inclusion."""
+
+
 def plan_of(design: Design, seed: int = 0) -> Plan:
     """Return what to learn of a design: its sensor, and specimens around the design's.
 
     Raises
     ------
     DesignError
-        For a design with a domed sensor, or one that is not pressed straight down on the middle.
+        For a design with a domed sensor, or one that is not pressed straight down on the middle, and for a
+        specimen too thin for inclusions of that size.
     """
     for field, value in (
         ("waveguide.dome_radius_mm", design.waveguide.dome_radius_mm),
@@ -40,17 +46,22 @@ def plan_of(design: Design, seed: int = 0) -> Plan:
             raise DesignError(
                 field, shown(value), "none: emulators know flat sensors, straight on the middle"
             )
-    from fem.sampling import Plan, Ranges
+    from fem.sampling import CLEARANCE, Plan, Ranges
 
     slab, width = design.slab(), design.waveguide.width_mm
+    smallest, shallowest, thickest = 0.08 * width, 0.16 * width, 4 / 3
+    least = math.ceil(10 * _ROOM * (CLEARANCE + smallest + shallowest) / thickest) / 10
+    if slab.thickness_mm < least:
+        allowed = f"at least {least:g} mm: an emulator's inclusions keep {CLEARANCE:g} mm from the chest wall"
+        raise DesignError("specimen.thickness_mm", shown(slab.thickness_mm), allowed)
     ranges = Ranges(
-        size_mm=(0.08 * width, 0.52 * width),
-        depth_mm=(0.16 * width, 0.48 * width),
+        size_mm=(smallest, 0.52 * width),
+        depth_mm=(shallowest, 0.48 * width),
         modulus_kPa=(4.0 * slab.modulus_kPa, 24.0 * slab.modulus_kPa),
         offset_mm=0.24 * width,
         indentation_mm=(0.1, design.max_indentation_mm * (1.0 if design.mechanics == "linear" else FINITE)),
         tissue_kPa=(0.6 * slab.modulus_kPa, 1.6 * slab.modulus_kPa),
-        thickness_mm=(0.8 * slab.thickness_mm, 4 / 3 * slab.thickness_mm),
+        thickness_mm=(0.8 * slab.thickness_mm, thickest * slab.thickness_mm),
     )
     return Plan(
         design.probe(),
