@@ -1,12 +1,16 @@
 """`twin emulate`: what it learns of a design, what it refuses, and that it goes on where it was cut off."""
 
 import dataclasses
+from collections.abc import Callable
+from concurrent.futures import Future
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import fem
+from fem import equilibrium, solving
 from fem.sampling import Plan, Ranges
 from fem.topology import Resolution
 from twin import emulate, load_design
@@ -92,6 +96,54 @@ def test_mistakes_are_one_line(
     assert not list(tmp_path.iterdir())
 
 
+class Here:
+    """Stands where worker processes do: all is done at once, in this one."""
+
+    def __init__(self, *_: object, **__: object) -> None: ...
+
+    def __enter__(self) -> "Here":
+        return self
+
+    def __exit__(self, *_: object) -> None: ...
+
+    def submit(self, work: Callable[..., None], *arguments: object) -> Future[None]:
+        done: Future[None] = Future()
+        try:
+            done.set_result(work(*arguments))
+        except Exception as error:
+            done.set_exception(error)
+        return done
+
+    def shutdown(self, **_: object) -> None: ...
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "line"),
+    [
+        (equilibrium.NotConverged("stuck at 2 mm"), 2, "specimen: received plain tissue of 3"),
+        (np.linalg.LinAlgError("singular"), 2, "cannot be pressed by 3 mm (singular); allowed"),
+        (BrokenProcessPool("a child died"), 1, "workers: received one that ended by itself"),
+    ],
+)
+def test_plain_tissue_that_cannot_be_followed_is_one_line(
+    error: Exception,
+    status: int,
+    line: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def fails(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(solving, "ProcessPoolExecutor", Here)
+    monkeypatch.setattr(solving, "background", fails)
+    assert main(["emulate", "tsis", "--workers", "1", "--out", str(tmp_path / "a.npz")]) == status
+    told = [said for said in capsys.readouterr().err.splitlines() if said.startswith("twin emulate: ")]
+    assert len(told) == 1 and line in told[0]
+    assert [place.name for place in (tmp_path / "a.npz.samples").iterdir()] == ["plan.json"]
+
+
 @pytest.mark.slow
 def test_builds_and_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -121,7 +173,7 @@ def test_builds_and_goes_on(
     assert (folder / "sample-00031.npz").exists()
     assert {place: place.stat().st_mtime_ns for place in kept} == kept
     said = capsys.readouterr().out
-    assert "emulator: " in said and "tared pressure, inclusions of 4 mm and more" in said
+    assert "emulator: " in said and "inclusions of 4 mm and more: errors not known" in said  # of seven
     built = fem.load_emulator(out)
     answer = built(built.plan.probe, fem.Slab(29.0, 44.0, 5.0), fem.Inclusion(8.0, 5.5, 60.0), 2.0)
     assert answer.force_N > answer.force_0_N > 0
