@@ -61,6 +61,7 @@ class Emulated:
     mechanics: str
     error_percent: float | None
     path: str = "emulated"
+    background: str = "shared"
 
 
 @dataclass(frozen=True)

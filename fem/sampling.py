@@ -30,6 +30,7 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.stats import qmc
 
 from fem import mesh
+from fem.contact_fields import contact_of
 from fem.equilibrium import State
 from fem.ground import bare_geometry, ground
 from fem.ground import lines as grid_lines
@@ -37,7 +38,6 @@ from fem.mesh import Geometry
 from fem.meshed import build
 from fem.model import Inclusion, Length, Poisson, Probe, Slab, check
 from fem.path import Path, path
-from fem.pressing import contact_of
 from fem.solver import one_thread
 from fem.topology import Resolution
 

@@ -100,6 +100,7 @@ def test_the_record_says_emulator_and_how_far_off_it_is(frames, tmp_path, capsys
     folder = frames[1].write(tmp_path / "out")
     record = json.loads((folder / "frame.json").read_text(encoding="utf-8"))["fem"]
     assert (record["mechanics"], record["emulated"], record["path"]) == ("emulator", "finite", "emulated")
+    assert record["background"] == "shared"
     assert record["error_percent"] == 1.5 and record["dof"] is None
     assert record["seconds"] < 1.0
     assert (folder / "overview.png").stat().st_size > 50_000

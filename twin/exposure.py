@@ -102,6 +102,7 @@ def mechanics_facts(design: Design, press: Press | Emulated) -> dict[str, Any]:
         **fem.scalars(press.surface, design.signal.displacement_um),
         "min_pressure_kPa": press.min_pressure_kPa,
         "path": press.path,
+        "background": press.background,
         "mechanics": "emulator" if emulated else press.mechanics,
         **({"emulated": press.mechanics} if emulated else {}),
         "error_percent": _known(press.error_percent),
