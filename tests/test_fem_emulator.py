@@ -325,6 +325,17 @@ def undeflatable(place: Path) -> bytes:
     return bytes(data)
 
 
+def unclosed(place: Path) -> bytes:
+    """An array of an older format, whose header is a dictionary without end."""
+    header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (3L,), "
+    data = io.BytesIO()
+    with zipfile.ZipFile(place) as old, zipfile.ZipFile(data, "w") as new:
+        for entry in old.namelist():
+            array = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header
+            new.writestr(entry, array if entry == "x.npy" else old.read(entry))
+    return data.getvalue()
+
+
 def test_a_strangers_file_is_not_trusted(
     emulator: Emulator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -346,7 +357,7 @@ def test_a_strangers_file_is_not_trusted(
         (tmp_path / "bad.npz").write_bytes(data)
         with pytest.raises(NotAnEmulator):
             load_emulator(tmp_path / "bad.npz")
-    for damaged in (encrypted(place), undeflatable(place)):
+    for damaged in (encrypted(place), undeflatable(place), unclosed(place)):
         (tmp_path / "bad.npz").write_bytes(damaged)
         with pytest.raises(NotAnEmulator):
             load_emulator(tmp_path / "bad.npz")
