@@ -36,8 +36,8 @@ def on_background(presses: Sequence[Press]) -> list[Press]:
     `displacement` and `pressure` of the surface become those of plain tissue on the common mesh, the former
     plus what the inclusion adds, the latter times what it multiplies it by; it has that mesh's nodes. All
     else, forces too, stays that of the press's own mesh. Where contact has opened anywhere, as it does under
-    domes and most tilted probes, presses are returned as they are (`Press.path` tells it); and, with a
-    warning, where plain tissue cannot be followed as deep on the common mesh.
+    domes and most tilted probes, presses are returned as they are; and, with a warning, where plain tissue
+    cannot be followed as deep on the common mesh. `Press.background` tells which.
     """
     if not presses or not all(one.path != "unilateral" and one.min_pressure_kPa > 0 for one in presses):
         return list(presses)
@@ -51,7 +51,8 @@ def on_background(presses: Sequence[Press]) -> list[Press]:
         warnings.warn(_OWN_MESH.format(levels[-1]), stacklevel=2)
         return list(presses)
     at = dict(zip(levels, grounds, strict=True))
-    return [replace(one, surface=_over(one.surface, at[one.indentation_0_mm])) for one in presses]
+    surfaces = [_over(one.surface, at[one.indentation_0_mm]) for one in presses]
+    return [replace(one, surface=s, background="shared") for one, s in zip(presses, surfaces, strict=True)]
 
 
 def _over(own: pv.PolyData, plain: pv.PolyData) -> pv.PolyData:

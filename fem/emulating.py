@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from fem.emulator import CENTRED, Emulator, amplitudes, features, lagrange, resample
 from fem.emulator_errors import Errors, off_the_edge
 from fem.regression import Regression, regress
-from fem.sampling import Plan, contrast, geometry_at
+from fem.sampling import NotBuilt, Plan, contrast, geometry_at
 from fem.solver import one_thread
-from fem.solving import KNOTS, STRETCHED, NotBuilt, Progress, knots, run, solved, tally
+from fem.solving import KNOTS, STRETCHED, Progress, knots, run, solved, tally
 from fem.surface import line_weights
 from fem.symmetry import unfold
 from fem.topology import Resolution
@@ -65,6 +65,10 @@ def build_emulator(
     for name, value in (("samples", samples), ("minutes", minutes), ("workers", workers)):
         if value is not None and not value > 0:
             raise NotBuilt(f"{name}: received {value}; allowed are positive numbers")
+    fewest = _FEWEST["sample"]
+    if samples is not None and samples < fewest:
+        raise NotBuilt(f"samples: received {samples}; allowed {fewest} and more")
+    plan.point(fewest - 1)  # refuses ranges that hold nothing before anything is solved
     seconds = None if minutes is None else 60 * minutes
     run(plan, Path(folder), samples, seconds, workers or os.cpu_count() or 1, tell)
     tell("fit", 0.0)

@@ -46,8 +46,9 @@ class Emulated:
         The contact surface with `displacement`, `pressure`, `area` and, without inclusion, `displacement_0`,
         `pressure_0`, `area_0`.
     error_percent
-        95th percentile of what held-out solves of inclusions of this kind (thicker than 4 mm, or not) were
-        off by: largest error of the tared displacement off the probe's edge, in per cent of its maximum.
+        95th percentile of what held-out solves of inclusions of this kind (`Errors.alike`: of 4 mm and more,
+        or not; or nearest in size) were off by: largest error of the tared displacement off the probe's
+        edge, in per cent of its maximum. None where too few were held out to tell.
     """
 
     surface: pv.PolyData
@@ -58,8 +59,9 @@ class Emulated:
     min_pressure_kPa: float
     seconds: float
     mechanics: str
-    error_percent: float
+    error_percent: float | None
     path: str = "emulated"
+    background: str = "shared"
 
 
 @dataclass(frozen=True)

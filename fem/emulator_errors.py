@@ -12,6 +12,12 @@ Floats = NDArray[np.float64]
 EDGE = 1.0
 """How wide the probe's edge is, where errors count apart, mm."""
 
+LARGE = 4.0
+"""Size from which inclusions count as large, mm: those below show little, and count apart."""
+
+FEWEST = 10
+"""Held-out samples below which nothing is said of percentiles."""
+
 
 def off_the_edge(x: Floats) -> NDArray[np.bool_]:
     """Which nodes of a grid with lines x (m,), mm, lie off the probe's edge, (m, m)."""
@@ -47,9 +53,19 @@ class Errors:
         """Share of the solves that failed, the worst kind's."""
         return float(100 * (self.solves[:, 1] / np.maximum(self.solves[:, 0], 1)).max())
 
-    def percentile(self, name: str, percent: float, size_mm: float = 4.0, kind: int = 0) -> float:
-        """Of errors `name` ("pressure" or "displacement") of inclusions with their `size_mm` on this one's
-        side of 4 mm; kind 0: largest off the edge, 1: root mean square, 2: largest."""
-        same = (self.size_mm >= 4.0) == (size_mm >= 4.0)
-        found = getattr(self, name)[same, kind]
-        return float(np.percentile(found, percent)) if len(found) else float("nan")
+    def alike(self, size_mm: float) -> NDArray[np.bool_]:
+        """Which samples tell of an inclusion of a size, (n,): those on its side of `LARGE`, or, if they are
+        too few, the `FEWEST` nearest to it in size; none where there are not so many."""
+        same = (self.size_mm >= LARGE) == (size_mm >= LARGE)
+        if same.sum() >= FEWEST:
+            return np.asarray(same)
+        if len(self.size_mm) < FEWEST:
+            return np.zeros(len(self.size_mm), bool)
+        away = np.abs(self.size_mm - size_mm)
+        return np.asarray(away <= np.partition(away, FEWEST - 1)[FEWEST - 1])
+
+    def percentile(self, name: str, percent: float, size_mm: float = LARGE, kind: int = 0) -> float | None:
+        """Of errors `name` ("pressure" or "displacement") of the samples that are `alike`; kind 0: largest
+        off the edge, 1: root mean square, 2: largest. None where too few samples were held out."""
+        found = getattr(self, name)[self.alike(size_mm), kind]
+        return float(np.percentile(found, percent)) if len(found) else None

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import io
 import os
+import tokenize
 import zipfile
 import zlib
 from dataclasses import fields
@@ -71,6 +72,7 @@ def load_emulator(place: str | Path | BinaryIO) -> Emulator:
         EOFError,
         OverflowError,
         MemoryError,  # a header may announce any size
+        tokenize.TokenError,  # numpy's word for a header that does not end
         zipfile.BadZipFile,
         zlib.error,
         RuntimeError,  # zipfile's word for encrypted parts, and for methods that it does not know

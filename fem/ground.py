@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 
 from fem import surface
+from fem.contact_fields import contact_of
 from fem.equilibrium import NotConverged
 from fem.mesh import Geometry
 from fem.meshed import build
 from fem.model import Inclusion, Pose, Probe, Slab
 from fem.path import path
-from fem.pressing import contact_of
 from fem.solver import one_thread
 from fem.topology import Resolution
 

@@ -19,8 +19,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import lru_cache
-from itertools import islice
-from typing import Annotated, Literal
+from itertools import count, islice
+from typing import Annotated, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.stats import qmc
 
 from fem import mesh
+from fem.contact_fields import contact_of
 from fem.equilibrium import State
 from fem.ground import bare_geometry, ground
 from fem.ground import lines as grid_lines
@@ -37,17 +38,18 @@ from fem.mesh import Geometry
 from fem.meshed import build
 from fem.model import Inclusion, Length, Poisson, Probe, Slab, check
 from fem.path import Path, path
-from fem.pressing import contact_of
 from fem.solver import one_thread
 from fem.topology import Resolution
 
 Floats = NDArray[np.float64]
+Some = TypeVar("Some", float, Floats)
 
 _CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False)
 _BEYOND = 0.03  # by how much of a range the samples reach beyond it: at the ends, regression is worst
 _OFFSETS = (1, 1), (0, 0), (1, 0), (0, 0)  # which of its offsets each point of four keeps
 CLEARANCE = 4.0
 """Least distance between inclusion and chest wall, mm."""
+_RAREST = 4096  # of so many specimens drawn one fits at least, or there are none to be had
 
 LEAN = Resolution(arc=3, core=1, shell=3, above=3, below=1, edge=2, side=3, layer=1, backing=1)
 """Mesh of the samples. Its rise differs from 115 thousand unknowns in a quarter by what
@@ -60,6 +62,10 @@ COARSE = Resolution(
 
 FINE = mesh.QUALITIES["standard"]
 """Mesh of what makes up for the lean one, and of what the background goes with (`fem.ground.fine`)."""
+
+
+class NotBuilt(ValueError):
+    """An emulator that cannot be built from what there is: one line says why."""
 
 
 def contrast(ratio: Floats) -> Floats:
@@ -126,6 +132,14 @@ class Plan:
             if not all(0.2 <= ratio <= 5 for ratio in res.growth):
                 raise ValueError(f"{name}: received {res}; allowed are cells that grow 0.2 to 5 times")
 
+        r = self.ranges
+        if clearance(r.size_mm[0], r.depth_mm[0], r.thickness_mm[1]) < 0:
+            least = CLEARANCE + r.size_mm[0] + r.depth_mm[0]
+            raise ValueError(
+                f"ranges.thickness_mm: received up to {r.thickness_mm[1]:g} mm; allowed well over {least:g} "
+                f"mm, so that inclusions of these ranges keep {CLEARANCE:g} mm from the chest wall"
+            )
+
     def slab(self, thickness: float, modulus: float) -> Slab:
         return Slab(thickness, self.width_mm, modulus, self.poisson, self.sides)
 
@@ -157,7 +171,10 @@ class Plan:
     def points(self) -> Iterator[Floats]:
         """Scrambled Sobol sequence of (size, depth, offsets x >= y >= 0, thickness, tissue, s), those that
         fit; s is that of the inclusion where one modulus is solved. Of four points one keeps its offsets, one
-        keeps x, and two lie under the probe's middle: symmetry makes these two and five times cheaper."""
+        keeps x, and two lie under the probe's middle: symmetry makes these two and five times cheaper.
+
+        Raises `NotBuilt` where hardly any specimen of the ranges fits.
+        """
         r = self.ranges
         low, high = (
             np.array(side) for side in zip(r.size_mm, r.depth_mm, r.thickness_mm, r.tissue_kPa, strict=True)
@@ -165,15 +182,23 @@ class Plan:
         beyond = _BEYOND * (high - low)
         sobol = qmc.Sobol(7, scramble=True, rng=np.random.default_rng(self.seed))
         number = 0
-        while True:
-            for u in sobol.random(64):
-                size, depth, thickness, tissue = low - beyond + u[:4] * (high - low + 2 * beyond)
-                x, y = np.sort(u[4:6])[::-1] * r.offset_mm * (1 + _BEYOND)
+        for drawn in count(0, 64):
+            if drawn > _RAREST * (number + 4):
+                raise NotBuilt(
+                    f"ranges: received {r}, of which hardly a specimen fits; allowed are inclusions that "
+                    f"keep {CLEARANCE:g} mm from the chest wall and stay within {self.width_mm:g} mm of width"
+                )
+            drawings = sobol.random(64)
+            specimens = low - beyond + drawings[:, :4] * (high - low + 2 * beyond)
+            offsets = np.sort(drawings[:, 4:6])[:, ::-1] * r.offset_mm * (1 + _BEYOND)
+            fit = clearance(*specimens[:, :3].T) >= 0
+            fit &= offsets[:, 0] + specimens[:, 0] / 2 < self.width_mm / 2
+            for u, specimen, (x, y) in zip(drawings[fit], specimens[fit], offsets[fit], strict=True):
+                size, depth, thickness, tissue = specimen
                 s = self.signals[0] + u[6] * (self.signals[1] - self.signals[0])
-                if clearance(size, depth, thickness) >= 0:
-                    keep_x, keep_y = _OFFSETS[number % len(_OFFSETS)]
-                    yield np.array([size, depth, keep_x * x, keep_y * y, thickness, tissue, s])
-                    number += 1
+                keep_x, keep_y = _OFFSETS[number % len(_OFFSETS)]
+                yield np.array([size, depth, keep_x * x, keep_y * y, thickness, tissue, s])
+                number += 1
 
     def inside(self, points: Floats) -> NDArray[np.bool_]:
         """Which of the points (n, 7) lie within the ranges, (n,)."""
@@ -190,7 +215,7 @@ class Plan:
 PLAN: TypeAdapter[Plan] = TypeAdapter(Plan)
 
 
-def clearance(size: float, depth: float, thickness: float) -> float:
+def clearance(size: Some, depth: Some, thickness: Some) -> Some:
     """Room left between an inclusion and the chest wall, less what an emulator wants there, mm."""
     return thickness - CLEARANCE - size - depth
 

@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from itertools import count
 from pathlib import Path
 
@@ -18,16 +19,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fem.model import NotConverged, NotModelled
-from fem.sampling import PLAN, Plan, background, refine, solve, stretch
+from fem.sampling import PLAN, NotBuilt, Plan, background, refine, solve, stretch
 
 Floats = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
 
-class NotBuilt(ValueError):
-    """An emulator that cannot be built from what there is: one line says why."""
-
-
+_DEAD = (
+    "workers: received one that ended by itself, killed or out of memory; allowed are as many as the memory "
+    "holds (what is solved is kept: the same call goes on)"
+)
 _FORMAT = 3  # of the files in a folder
 SHARE = 8  # samples for each pair of a fine and a lean mesh
 STRETCHED = 3  # samples for each one at finite strain, which is the same specimen as an earlier one
@@ -68,7 +69,7 @@ def run(
     Raises
     ------
     NotBuilt
-        If the folder belongs to another plan.
+        If the folder belongs to another plan, plain tissue cannot be followed, or a worker ends by itself.
     """
     start = time.monotonic()
     claim(plan, folder)
@@ -92,10 +93,12 @@ def run(
                 progress(f"{kind} {number + 1}", min(1.0, max(by_time, by_count)))
             for future in running:
                 future.result()
-        except BaseException:
+        except BaseException as error:
             pool.shutdown(wait=False, cancel_futures=True)
             for worker in multiprocessing.active_children():  # what they are at is left undone
                 worker.terminate()
+            if isinstance(error, BrokenProcessPool):
+                raise NotBuilt(_DEAD) from ChildProcessError(str(error))
             raise
 
 
@@ -150,6 +153,8 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
+# what a solve that finds no equilibrium ends in
+_UNSOLVED = (NotConverged, NotModelled, ArithmeticError, np.linalg.LinAlgError)
 _SOLVES = {"sample": solve, "pair": refine, "stretch": stretch}
 
 
@@ -159,12 +164,20 @@ def _work(plan_json: bytes, folder: str, kind: str, number: int) -> None:
     if kind == "background":
         thick, tissue = knots(plan)
         i, j = divmod(number, KNOTS[1])
-        found = background(plan, float(1 / thick[i]), float(np.exp(tissue[j])))
+        specimen = float(1 / thick[i]), float(np.exp(tissue[j]))
+        try:
+            found = background(plan, *specimen)
+        except _UNSOLVED as error:  # no answer goes without it
+            raise NotBuilt(
+                f"specimen: received plain tissue of {specimen[0]:.3g} mm and {specimen[1]:.3g} kPa, which "
+                f"cannot be pressed by {plan.ranges.indentation_mm[1]:g} mm ({error}); allowed are specimens "
+                "that can, or small strain"
+            ) from None
     else:
         point = plan.point(number)
         try:
             found = _SOLVES[kind](plan, point)
-        except (NotConverged, NotModelled, ArithmeticError, np.linalg.LinAlgError):
+        except _UNSOLVED:
             found = {}  # kept as a gap, so that a build that goes on does not try it again
         found["point"] = point
     found["seconds"] = np.array(time.process_time() - start)

@@ -38,6 +38,8 @@ def discretisation_error(geometry: Geometry, res: Resolution, full: Path, bare: 
 
     Parameters
     ----------
+    res
+        That of a quality.
     full, bare
         Paths with and without inclusion on the mesh in question.
     """
@@ -47,16 +49,10 @@ def discretisation_error(geometry: Geometry, res: Resolution, full: Path, bare: 
     largest = np.abs(fine).max()
     if largest < _SILENT:
         return 0.0
-    coarser = COARSER.get(res) or _halved(res)
-    model = build(geometry, coarser, False)
+    model = build(geometry, COARSER[res], False)
     bare = path(geometry, model, False)
     coarse = tared(geometry, path(geometry, model, True, bare), bare)
     return float(100 * SHARE * np.abs(fine - coarse).max() / largest)
-
-
-def _halved(res: Resolution) -> Resolution:
-    """A coarser mesh for a resolution that is no quality."""
-    return Resolution(**{name: max(1, round(0.75 * cells)) for name, cells in res.__dict__.items()})
 
 
 def tared(geometry: Geometry, full: Path, bare: Path) -> Floats:

@@ -189,6 +189,33 @@ def test_unknowns_and_presses_that_cannot_be_are_refused(bench: Any) -> None:
         bench(layout((50.0,)))
 
 
+@pytest.mark.parametrize("emulator", [Emulator(), None])
+def test_steps_beyond_what_a_design_allows_are_taken_on_the_other_side(
+    emulator: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The press may be no deeper, its specimen no thinner, its inclusion no larger; fields go as depth over
+    thickness here."""
+    deepest = design()
+    deepest = replace(deepest, press=replace(deepest.press, indentation_mm=(6.0,)))
+    ball = replace(BALL, size=30.0 - 15.0 - 0.02, depth=15.0)  # near the chest wall
+
+    class Thin(Pressed):
+        path = "tied"
+
+        def __init__(self, there: twin.Design, inside: fem.Inclusion, level: float) -> None:
+            super().__init__(there, replace(inside, size=9.0), level * 30.0 / there.specimen.thickness_mm)
+
+    monkeypatch.setattr(touches.presses, "emulated", lambda d, b, lv, e: [Thin(d, b, one) for one in lv])
+    monkeypatch.setattr(touches, "_press", lambda there, inside: Thin(there, inside, 1.0))
+    monkeypatch.setattr(touches.fem, "press_moduli", lambda *_, **__: [[Thin(deepest, ball, 1.0)]])
+    unknowns = [Unknown("specimen.thickness_mm", 1.0), Unknown("size_mm", 3.2), Unknown(DEPTH, 0.01, True)]
+    found = touches.touch(deepest, ball, 6.0, (0.0, 0.0), unknowns, emulator)
+    plain = found.plain[3]
+    assert found.slopes["specimen.thickness_mm"][1, 3] == pytest.approx(-plain / 30.0, rel=1e-4)
+    assert found.slopes[DEPTH][1, 3] == pytest.approx(plain, rel=1e-4)
+    assert np.abs(found.slopes["size_mm"]).max() < 1e-6
+
+
 @pytest.mark.slow
 def test_solved_slopes_are_those_of_independent_solves() -> None:
     """On finer meshes, which share nothing but the physics: by symmetry, by proportion, by difference."""

@@ -11,6 +11,8 @@ import fem
 from fem import background
 from fem.ground import bare_geometry, fine
 from fem.sampling import lines
+from twin import load_design
+from twin.exposure import mechanics_facts
 
 PROBE = fem.Probe(25, (fem.Layer(2, 27), fem.Layer(3, 61), fem.Layer(5, 156)))
 SLAB = fem.Slab(30, 60, 5)
@@ -66,6 +68,8 @@ def test_what_the_inclusion_does_stays(which: str, request: pytest.FixtureReques
         assert force(shared, suffix) == pytest.approx(force(own, suffix), rel=0.02)
     assert force(shared) / force(shared, "_0") == pytest.approx(force(own) / force(own, "_0"), rel=1e-3)
     assert (shared.force_N, shared.path) == (own.force_N, own.path)
+    facts = [mechanics_facts(load_design("tsis"), one) for one in (own, shared)]
+    assert [told["background"] for told in facts] == ["own", "shared"]
 
 
 def test_plain_tissue_is_its_own_background() -> None:
@@ -90,3 +94,4 @@ def test_a_press_without_the_common_background_is_told(
     with pytest.warns(UserWarning, match="could not be followed to 1 mm"):
         (found,) = fem.on_background([large])
     assert found.surface is large.surface
+    assert mechanics_facts(load_design("tsis"), found)["background"] == "own"

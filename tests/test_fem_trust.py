@@ -11,7 +11,7 @@ from fem.mesh import QUALITIES, Geometry
 from fem.meshed import build
 from fem.path import Path, path
 from fem.topology import Resolution
-from fem.trust import discretisation_error, tared
+from fem.trust import COARSER, discretisation_error, tared
 
 PROBE = fem.Probe(25, (fem.Layer(2, 27), fem.Layer(3, 61), fem.Layer(5, 156)))
 SLAB = fem.Slab(30, 60, 5)
@@ -37,6 +37,10 @@ def test_estimate_is_near_the_true_error(size: float, depth: float) -> None:
         ratios[quality] = discretisation_error(geometry, QUALITIES[quality], *found) / true
         print(f"size {size} depth {depth} {quality}: true {true:.3f} %, ratio {ratios[quality]:.2f}")
     assert all(0.5 < ratio < 3 for ratio in ratios.values())
+
+
+def test_every_quality_has_a_coarser_mesh() -> None:
+    assert set(COARSER) == set(QUALITIES.values())
 
 
 def test_nothing_to_see_has_no_error() -> None:

@@ -128,3 +128,11 @@ def test_noise_is_the_cameras() -> None:
     assert noise.read_dn * camera.gain_e_per_dn == pytest.approx(np.sqrt(900.0 + dark))
     assert noise.offset_dn == pytest.approx(5.0 + dark / camera.gain_e_per_dn)
     assert (noise.frames, noise.bits) == (4, camera.bits)
+
+
+def test_the_deepest_press_has_slopes_to_the_thickness(found: Any) -> None:
+    """Of thinner specimens it would be too deep: both steps are taken on the other side."""
+    design = small()
+    design = replace(design, press=replace(design.press, indentation_mm=(6.0,)))
+    told = found([Unknown("specimen.thickness_mm", 1.0)], levels=(6.0,), design=design)
+    assert np.abs(told.jacobian).max() < 1e-6 * told.mean.max()  # these presses know nothing of it

@@ -65,6 +65,8 @@ def test_the_shipped_studies_can_be_explored():
             ["inclusion.depth", "chest wall"],
         ),
         ("[search]", "[protocol]\nindentation_mm=[40.0]\n[search]", ["protocol.indentation_mm", "40"]),
+        ("[search]", '[set]\n"press.tilt_deg" = [1.0, 0.0]\n[search]', ["press.tilt_deg", "(1.0, 0.0)"]),
+        ("[search]", '[set]\n"press.position_mm" = [0.0, 2.0]\n[search]', ["press.position_mm", "(0, 0)"]),
     ],
 )
 def test_a_mistake_is_one_line(tmp_path, capsys, before, after, words):
@@ -95,6 +97,7 @@ def test_a_fields_kind_is_what_it_changes():
         "layout.leds": ([1, 8], "optical"),
         "surface.rms_slope": ([1.0, 3.0], "optical"),
         "protocol.indentation_mm": ({"choices": [[1.0], [1.0, 2.0]]}, "optical"),
+        "press.indentation_mm": ({"choices": [[1.0], [1.0, 2.0]]}, "optical"),
         "waveguide.layers.0.modulus_kPa": ([10.0, 50.0], "mechanical"),
         "layout.layers": ({"choices": [[[5.0, 20.0]], [[2.0, 20.0], [8.0, 100.0]]]}, "mechanical"),
         "specimen.thickness_mm": ([25.0, 40.0], "mechanical"),
@@ -117,6 +120,12 @@ def test_fields_make_the_sensor_that_they_say():
     assert on_x == pytest.approx([-6.25, 6.25])
     with pytest.raises(DesignError, match="z_mm"):
         layout_fields.layout(study, design, {"leds.*.z_mm": -9.9})
+
+
+def test_a_trial_is_pressed_as_deep_as_the_studys_own_design():
+    study, design = parse(TEXT + '[set]\n"press.indentation_mm" = [1.0]\n'), twin.load_design("tsis")
+    assert layout_fields.base(study, design).protocol.indentation_mm == (1.0,)
+    assert layout_fields.layout(study, design, {}).protocol.indentation_mm == (1.0,)
 
 
 def test_layers_of_their_own_index_are_not_dropped_in_silence():

@@ -19,11 +19,12 @@ from fem.solving import KNOTS
 from fem.topology import Resolution
 from twin import presses
 from twin.cli import main
-from twin.emulate import plan_of
+from twin.emulate import plan_of, summary
 from twin.reporting import summarise
 
 TINY = Resolution(arc=2, core=1, shell=1, above=1, below=1, edge=1, side=1, layer=1, backing=1)
 QUICK = {"quality": "preview", "device": "cpu"}
+SAMPLED = ("size_mm", "pressure", "displacement")  # what `Errors` has for each sample
 PRESS = ["--size", "9", "--depth", "5", "--modulus", "80", "--quality", "preview", "--seed", "3"]
 
 
@@ -99,6 +100,7 @@ def test_the_record_says_emulator_and_how_far_off_it_is(frames, tmp_path, capsys
     folder = frames[1].write(tmp_path / "out")
     record = json.loads((folder / "frame.json").read_text(encoding="utf-8"))["fem"]
     assert (record["mechanics"], record["emulated"], record["path"]) == ("emulator", "finite", "emulated")
+    assert record["background"] == "shared"
     assert record["error_percent"] == 1.5 and record["dof"] is None
     assert record["seconds"] < 1.0
     assert (folder / "overview.png").stat().st_size > 50_000
@@ -106,6 +108,20 @@ def test_the_record_says_emulator_and_how_far_off_it_is(frames, tmp_path, capsys
     printed = " ".join(capsys.readouterr().out.split())
     assert "mechanics: emulator (finite strain)" in printed
     assert "95 % of held-out solves were met within: 1.5 %" in printed
+
+
+def test_an_error_that_nobody_knows_is_null_and_told(tmp_path, capsys):
+    """Too few samples were held out to tell; the picture is kept all the same."""
+    known = invented()
+    few = replace(known, errors=replace(known.errors, **{n: getattr(known.errors, n)[:9] for n in SAMPLED}))
+    frame = twin.simulate(small(), INCLUSION, 1.0, mechanics="emulator", emulator=few, seed=7, **QUICK)
+    record = json.loads((frame.write(tmp_path / "out") / "frame.json").read_text(encoding="utf-8"))["fem"]
+    assert record["error_percent"] is None
+    summarise([frame], tmp_path)
+    assert "95 % of held-out solves were met within: not known" in " ".join(capsys.readouterr().out.split())
+    said = summary(few, "few.npz")
+    assert said.count("not known") == 2 and "nan" not in said
+    assert "smaller ones, by the nearest samples of 8 to 8 mm" in summary(known, "many.npz")
 
 
 def test_plain_tissue_and_presses_by_force():

@@ -30,6 +30,11 @@ def mechanics_in_words(fem: Mapping[str, Any]) -> str:
     return f"{_STRAIN.get(fem['mechanics'], fem['mechanics'])}, {_CONTACT.get(fem['path'], fem['path'])}"
 
 
+def percent_in_words(percent: float | None, of: str = "") -> str:
+    """Return an error, ``1.5 % of its maximum``, or that nobody knows it."""
+    return "not known" if percent is None else f"{percent:.2g} %{of}"
+
+
 def error_in_words(fem: Mapping[str, Any]) -> str:
     """Return what ``error_percent`` of a frame is: of the mesh, or of an emulator."""
     return (

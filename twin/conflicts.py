@@ -130,6 +130,15 @@ def black(design: Design, what: str) -> None:
         raise DesignError("housing.reflectance", shown(design.housing.reflectance), allowed)
 
 
+def straight(design: Design, what: str) -> None:
+    """Raise `DesignError` if a design's sensor is tilted or beside the middle, as `what` does not press."""
+    for name in ("tilt_deg", "position_mm"):
+        value = tuple(getattr(design.press, name))
+        if any(value):
+            allowed = f"(0, 0) in {what}: it presses straight down on the specimen's middle"
+            raise DesignError(f"press.{name}", shown(value), allowed)
+
+
 def colourless(design: Design, what: str) -> None:
     """Raise `DesignError` if a design's inclusion has optics of its own, which `what` cannot show."""
     if design.specimen.inclusion is not None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import fem
+from fem.emulator_errors import LARGE, Errors
+from twin.captions import percent_in_words
 from twin.complaint import DesignError, shown
 from twin.design import Design
 from twin.stage import check_file
@@ -21,13 +24,18 @@ FINITE = 0.5
 `tsis`. Beyond, the probe's soft corners fold over inclusions under them."""
 
 
+_ROOM = 1.1
+"""How much thicker the thickest specimens are than what holds the smallest and shallowest inclusion."""
+
+
 def plan_of(design: Design, seed: int = 0) -> Plan:
     """Return what to learn of a design: its sensor, and specimens around the design's.
 
     Raises
     ------
     DesignError
-        For a design with a domed sensor, or one that is not pressed straight down on the middle.
+        For a design with a domed sensor, or one that is not pressed straight down on the middle, and for a
+        specimen too thin for inclusions of that size.
     """
     for field, value in (
         ("waveguide.dome_radius_mm", design.waveguide.dome_radius_mm),
@@ -38,17 +46,22 @@ def plan_of(design: Design, seed: int = 0) -> Plan:
             raise DesignError(
                 field, shown(value), "none: emulators know flat sensors, straight on the middle"
             )
-    from fem.sampling import Plan, Ranges
+    from fem.sampling import CLEARANCE, Plan, Ranges
 
     slab, width = design.slab(), design.waveguide.width_mm
+    smallest, shallowest, thickest = 0.08 * width, 0.16 * width, 4 / 3
+    least = math.ceil(10 * _ROOM * (CLEARANCE + smallest + shallowest) / thickest) / 10
+    if slab.thickness_mm < least:
+        allowed = f"at least {least:g} mm: an emulator's inclusions keep {CLEARANCE:g} mm from the chest wall"
+        raise DesignError("specimen.thickness_mm", shown(slab.thickness_mm), allowed)
     ranges = Ranges(
-        size_mm=(0.08 * width, 0.52 * width),
-        depth_mm=(0.16 * width, 0.48 * width),
+        size_mm=(smallest, 0.52 * width),
+        depth_mm=(shallowest, 0.48 * width),
         modulus_kPa=(4.0 * slab.modulus_kPa, 24.0 * slab.modulus_kPa),
         offset_mm=0.24 * width,
         indentation_mm=(0.1, design.max_indentation_mm * (1.0 if design.mechanics == "linear" else FINITE)),
         tissue_kPa=(0.6 * slab.modulus_kPa, 1.6 * slab.modulus_kPa),
-        thickness_mm=(0.8 * slab.thickness_mm, 4 / 3 * slab.thickness_mm),
+        thickness_mm=(0.8 * slab.thickness_mm, thickest * slab.thickness_mm),
     )
     return Plan(
         design.probe(),
@@ -102,15 +115,10 @@ def summary(emulator: fem.Emulator, out: str) -> str:
         f"emulator: {emulator.plan.mechanics} mechanics, presses of {low:g} to {high:g} mm, "
         f"{len(errors.size_mm)} samples held out in turn"
     )
-    for what, size in (("inclusions of 4 mm and more", 4.0), ("smaller ones", 0.0)):
-        for name in ("pressure", "displacement"):
-            typical, bad = (errors.percentile(name, percent, size) for percent in (50, 95))
-            lines.append(
-                f"tared {name}, {what}: largest error off the edge {typical:.2g} % of its maximum (median of "
-                f"held-out samples), {bad:.2g} % (95th percentile)"
-            )
-        typical, bad = (errors.percentile("pressure", percent, size, 2) for percent in (50, 95))
-        lines.append(f"tared pressure, {what}: on the whole surface {typical:.2g} % and {bad:.2g} %")
+    smallest = emulator.plan.ranges.size_mm[0]
+    lines += _errors(errors, "inclusions of 4 mm and more", max(smallest, LARGE))
+    if smallest < LARGE:
+        lines += _errors(errors, "smaller ones", smallest)
     for count, more, seconds, median, bad, *_ in errors.curve:
         solves = f"{count:.0f} samples" + (f" ({more:.0f} at finite strain)" if more else "")
         lines.append(
@@ -120,3 +128,21 @@ def summary(emulator: fem.Emulator, out: str) -> str:
     lines.append(f"solves that failed: {failed} of {int(errors.solves[:, 0].sum())}")
     lines.append(f"file: {Path(out)}")
     return "\n".join(lines)
+
+
+def _errors(errors: Errors, what: str, size: float) -> Iterator[str]:
+    """Yield what held-out samples say of inclusions of a size and alike."""
+    of = errors.size_mm[errors.alike(size)]
+    if not of.size:
+        yield f"tared pressure and displacement, {what}: errors not known, too few samples were held out"
+        return
+    if ((of >= LARGE) != (size >= LARGE)).any():  # too few of its kind
+        what += f", by the nearest samples of {of.min():.2g} to {of.max():.2g} mm"
+    for name in ("pressure", "displacement"):
+        typical, bad = (percent_in_words(errors.percentile(name, percent, size)) for percent in (50, 95))
+        yield (
+            f"tared {name}, {what}: largest error off the edge {typical} of its maximum (median of "
+            f"held-out samples), {bad} (95th percentile)"
+        )
+    typical, bad = (percent_in_words(errors.percentile("pressure", percent, size, 2)) for percent in (50, 95))
+    yield f"tared pressure, {what}: on the whole surface {typical} and {bad}"

@@ -20,7 +20,7 @@ from twin import coarse as pixels
 from twin import objectives, touches
 from twin.bench import Bench, Work, optical_key
 from twin.complaint import DesignError, shown
-from twin.conflicts import black, colourless
+from twin.conflicts import black, colourless, straight
 from twin.design import Design
 from twin.exposure import REFERENCE_FRAMES
 from twin.fields import number_at, put, tables_of
@@ -208,6 +208,7 @@ def check(layout: Layout, inclusions: Sequence[fem.Inclusion]) -> None:
         raise DesignError("inclusions", "none", "at least one")
     colourless(layout.design, "a layout study")
     black(layout.design, "a layout study")
+    straight(layout.design, "a layout study")
     for level in layout.protocol.indentation_mm:
         layout.design.check_indentation(level, "protocol.indentation_mm")
     for inclusion in inclusions:

@@ -102,10 +102,16 @@ def mechanics_facts(design: Design, press: Press | Emulated) -> dict[str, Any]:
         **fem.scalars(press.surface, design.signal.displacement_um),
         "min_pressure_kPa": press.min_pressure_kPa,
         "path": press.path,
+        "background": press.background,
         "mechanics": "emulator" if emulated else press.mechanics,
         **({"emulated": press.mechanics} if emulated else {}),
-        "error_percent": press.error_percent,
+        "error_percent": _known(press.error_percent),
     }
+
+
+def _known(percent: float | None) -> float | None:
+    """A number that JSON can hold, or None."""
+    return percent if percent is not None and np.isfinite(percent) else None
 
 
 def picture_facts(

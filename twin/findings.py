@@ -117,7 +117,7 @@ def _leds(checkup: Checkup) -> Iterator[Finding]:
             _these(blind, len(leds), ".peak_nm"),
             "the camera is blind to its light (quantum efficiency 0)",
             "Its layer of the picture is black",
-            "Take an LED of a wavelength that the camera sees, or give camera.quantum_efficiency there",
+            "Take an LED of a wavelength that it sees, or give camera.quantum_efficiency there",
         )
     seen = [number for number in lit if checkup.in_sight_percent[number] > 0.0]
     if seen:
@@ -372,9 +372,8 @@ def _signal(checkup: Checkup) -> Iterator[Finding]:
             "The picture's scalars will be zero",
             "Lower the threshold, or expose longer",
         )
-    step = 1.0 / np.sqrt(12.0)
     saturated = checkup.standard is not None and checkup.standard.saturated_percent > SATURATED["error"]
-    if signal.noise_dn < 1.3 * step and not saturated:
+    if signal.noise_dn < 1.3 / np.sqrt(12.0) and not saturated:
         yield Finding(
             "note",
             "camera.gain_e_per_dn",

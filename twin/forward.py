@@ -118,11 +118,11 @@ def expected(
         middle = replace(middle, mean=stage.pictures((), middle).mean)
     slopes = []
     for number, (unknown, value, step) in enumerate(zip(unknowns, values, steps, strict=True)):
-        ends = (value - step, value + step)
-        if unknown.relative:
-            ends = (value * np.exp(-step), value * np.exp(step))
-        low, high = (stage.pictures(((unknown.name, to),), middle if again else None).mean for to in ends)
-        slopes.append((high - low) / (2.0 * step))
+
+        def at(to: float, name: str = unknown.name) -> Floats:
+            return stage.pictures(((name, to),), middle if again else None).mean
+
+        slopes.append(slope_of(at, unknown, value, step, middle.mean))
         if progress is not None:
             progress((number + 1) / len(unknowns))
     return Expected(tuple(unknown.name for unknown in unknowns), middle.mean, np.stack(slopes))
@@ -164,6 +164,40 @@ def step_of(unknown: Unknown, value: float) -> float:
         return min(_STEP * unknown.sd, _MOST_RELATIVE)
     most = _MOST[unknown.name] if unknown.name in _MOST else _MOST_RELATIVE * abs(value)
     return min(_STEP * unknown.sd, most)
+
+
+def slope_of(
+    at: Callable[[float], Floats], unknown: Unknown, value: float, step: float, middle: Floats
+) -> Floats:
+    """Slope of a field by a central difference; where one side is refused by three points on the other.
+
+    Parameters
+    ----------
+    at : the field where the unknown has a value.
+    middle : the field where it has its own.
+
+    Raises
+    ------
+    DesignError, fem.NotModelled
+        Where both sides are refused.
+    """
+    refused = DesignError, fem.NotModelled
+    low, high = _ends(unknown, value, step)
+    try:
+        return (at(high) - at(low)) / (2.0 * step)
+    except refused:
+        lower, higher = _ends(unknown, value, 2.0 * step)
+        try:
+            one, two, sign = at(low), at(lower), 1.0
+        except refused:
+            one, two, sign = at(high), at(higher), -1.0
+        return sign * (3.0 * middle - 4.0 * one + two) / (2.0 * step)
+
+
+def _ends(unknown: Unknown, value: float, step: float) -> tuple[float, float]:
+    if unknown.relative:
+        return float(value * np.exp(-step)), float(value * np.exp(step))
+    return value - step, value + step
 
 
 @dataclass(frozen=True)

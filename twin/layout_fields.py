@@ -119,7 +119,7 @@ def layout(study: LayoutStudy, design: Design, values: Mapping[str, Value]) -> L
     wanted = {name: meant(name, value, own[name].choices) for name, value in values.items()}
     fields = {name: value for name, value in wanted.items() if name not in PROTOCOL}
     made = changed_design(design, {**study.set, **fields}, "fields")
-    protocol = study.use(design.press.indentation_mm)
+    protocol = study.use(made.press.indentation_mm)
     if "protocol.indentation_mm" in wanted or "protocol.positions_mm" in wanted:
         from pydantic import TypeAdapter, ValidationError
 
@@ -182,12 +182,12 @@ def kind_of(study: LayoutStudy, design: Design, name: str, one: Axis) -> Kind:
     seen, pressed = set(), set()
     for value in some(one, whole(name, design)):
         try:
-            there = layout(study, design, {name: said(value)}).design
-            small = coarse(there)[0]
+            made = layout(study, design, {name: said(value)})
+            there, small = made.design, coarse(made.design)[0]
         except DesignError:
             continue
         felt = there.effective_modulus_kPa, there.surface.rms_slope, there.surface.kappa
-        seen.add(repr((optical_key(small), felt)))
+        seen.add(repr((optical_key(small), felt, made.protocol.indentation_mm)))
         pressed.add(repr((there.probe(), there.slab())))
     if len(pressed) > 1:
         return "mechanical"

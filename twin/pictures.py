@@ -17,7 +17,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from scenes.exr import write_bytes
-from twin.captions import error_in_words, inclusion_in_words, mechanics_in_words
+from twin.captions import error_in_words, inclusion_in_words, mechanics_in_words, percent_in_words
 from twin.cutaway import draw_cut, draw_profiles
 from twin.panels import (
     FAINT,
@@ -156,7 +156,7 @@ def _facts(axes: Axes, frame: Pictured, letter: str) -> None:
         ("force", f"{frame.press['force_N']:.4f} N"),
         ("lowest contact pressure", f"{fem['min_pressure_kPa']:.3f} kPa"),
         ("mechanics", mechanics_in_words(fem)),
-        (error_in_words(fem), f"{fem['error_percent']:.2g} % of its maximum"),
+        (error_in_words(fem), percent_in_words(fem["error_percent"], " of its maximum")),
         ("unknowns of the mechanics", "none" if fem["dof"] is None else _number(fem["dof"])),
         ("LEDs", _coupling(frame)),
         ("noise of the computed light", f"{tsis['noise_percent']:.2f} % of its mean (rms)"),

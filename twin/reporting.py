@@ -14,7 +14,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from rich.table import Table
 
 from twin import interrupt
-from twin.captions import inclusion_in_words, mechanics_in_words
+from twin.captions import inclusion_in_words, mechanics_in_words, percent_in_words
 from twin.frame import Frame
 from twin.light_bias import in_words as bias_in_words
 
@@ -126,11 +126,13 @@ def _trust(frames: Sequence[Frame]) -> Iterator[str]:
             where = " at " + ", ".join(f"{depth:.3g}" for depth in depths) + " mm"
         yield f"mechanics: {way}{where}"
     if frames[0].inclusion is not None:
-        worst = max(frame.fem["error_percent"] for frame in frames)
+        errors = [frame.fem["error_percent"] for frame in frames]
+        largest = None if None in errors else max(errors)
+        told = percent_in_words(largest, " of the tared displacement's maximum")
         what = "estimated error of the mesh"
         if frames[0].fem["mechanics"] == "emulator":
             what = "95 % of held-out solves were met within"
-        yield f"{what}: {worst:.2g} % of the tared displacement's maximum"
+        yield f"{what}: {told}"
     worst = max(frame.tsis["noise_percent"] for frame in frames)
     yield f"noise of the light: {worst:.2g} % of its mean (rms of a pixel, Monte Carlo)"
     yield bias_in_words(frames[0].tsis)

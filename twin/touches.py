@@ -117,29 +117,21 @@ def _emulated(
         if unknown.name in _SKIN:
             found[unknown.name] = _skin(unknown, value, middle)
             continue
-        found[unknown.name] = _central(fields, unknown, value, step, middle)
+        found[unknown.name] = _slope(fields, unknown, value, step, middle)
     return Touch(*middle, found, steps)
 
 
-def _central(
+def _slope(
     fields: Callable[[dict[str, float]], tuple[Floats, Floats]],
     unknown: Unknown,
     value: float,
     step: float,
     middle: tuple[Floats, Floats],
 ) -> NDArray[np.float32]:
-    """Slope by a central difference; at the edge of what the emulator knows by three points on one side."""
-    (low, high), name = _ends(unknown, value, step), unknown.name
-    try:
-        return _difference(fields({name: high}), fields({name: low}), step)
-    except fem.NotModelled:
-        lower, higher = _ends(unknown, value, 2.0 * step)
-        try:
-            one, two, sign = fields({name: low}), fields({name: lower}), 1.0
-        except fem.NotModelled:
-            one, two, sign = fields({name: high}), fields({name: higher}), -1.0
-        slope = sign * (3.0 * np.stack(middle) - 4.0 * np.stack(one) + np.stack(two)) / (2.0 * step)
-        return np.asarray(slope, np.float32)
+    def at(to: float) -> Floats:
+        return np.stack(fields({unknown.name: to}))
+
+    return forward.slope_of(at, unknown, value, step, np.stack(middle)).astype(np.float32)
 
 
 def _solved(design: Design, ball: fem.Inclusion, level: float, unknowns: Sequence[Unknown]) -> Touch:
@@ -148,6 +140,7 @@ def _solved(design: Design, ball: fem.Inclusion, level: float, unknowns: Sequenc
 
     def fields(changes: dict[str, float]) -> tuple[Floats, Floats]:
         there, inclusion, _ = _changed(design, ball, changes)
+        there.check_inclusion(inclusion)
         return _both(design, there, _press(there, inclusion).surface)
 
     steps = {u.name: forward.step_of(u, value_of(design, ball, u.name)) for u in unknowns}
@@ -176,8 +169,7 @@ def _solved(design: Design, ball: fem.Inclusion, level: float, unknowns: Sequenc
             high = fields({name: step})
             found[name] = _difference(high, (_mirrored(high[0]), _mirrored(high[1])), step)
         else:
-            low, high = (fields({name: end}) for end in _ends(unknown, value, step))
-            found[name] = _difference(high, low, step)
+            found[name] = _slope(fields, unknown, value, step, middle)
     for name in found:
         if knows_inclusion(name):
             # the mesh follows the inclusion, and the error of the background with it: what the inclusion adds
@@ -224,12 +216,6 @@ def _changed(
     fields = [(name, value) for name, value in changes.items() if name not in INCLUSION and name != DEPTH]
     there = parse_design(put(tables_of(design), fields)) if fields else design
     return there, replace(ball, **own), changes.get(DEPTH, 1.0)
-
-
-def _ends(unknown: Unknown, value: float, step: float) -> tuple[float, float]:
-    if unknown.relative:
-        return float(value * np.exp(-step)), float(value * np.exp(step))
-    return value - step, value + step
 
 
 def _both(design: Design, there: Design, surface: Any) -> tuple[Floats, Floats]:
