@@ -10,7 +10,7 @@ import pytest
 from test_explore import STUDY, prepared
 
 import twin
-from twin import explore, explore_folder
+from twin import explore, explore_crew, explore_folder
 from twin.cli import main
 from twin.complaint import DesignError
 from twin.explored import design_toml
@@ -161,3 +161,13 @@ def test_one_that_was_cut_off_before_it_had_begun_goes_on(tmp_path: Path) -> Non
     for name in (explore_folder.STUDY, explore_folder.HEAD):
         (found.folder / name).unlink()
     assert prepared(tmp_path) == found
+
+
+def test_workers_run_nothing_of_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stranger's study may come with a file called like a module; the worker gets to its empty DIR."""
+    (tmp_path / "tomllib.py").write_text("open('ran', 'w').close()\nraise SystemExit(3)\n")
+    (tmp_path / "out" / "workers").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path)
+    assert explore_crew._start(Path("out"), 0).wait(60) == 1
+    assert not (tmp_path / "ran").exists()
+    assert "FileNotFoundError" in (tmp_path / "out" / "workers" / "0.log").read_text()
