@@ -6,8 +6,10 @@ import shutil
 import stat
 from pathlib import Path
 
+import numpy as np
 import pytest
 from test_explore import STUDY, prepared
+from test_lamp import file_of
 
 import twin
 from twin import explore, explore_crew, explore_folder
@@ -49,6 +51,31 @@ def test_another_sensor_does_not_get_the_folder(tmp_path: Path, capsys: pytest.C
     before = all_of(out)
     refused(["--out", "another sensor", "camera.read_noise_e"], capsys, file, "--out", out)
     assert all_of(out) == before
+
+
+def test_luminaires_are_known_by_what_they_say(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Named from the folder of the design, which the study names from where the designer stands."""
+    angles = np.array([0.0, 45.0, 90.0])
+    lamp = tmp_path / "d" / "lamp.ies"
+    lamp.parent.mkdir()
+    lamp.write_text(file_of(angles, np.zeros(1), np.array([100.0, 70.0, 0.0])))
+    text = design_toml(twin.load_design("tsis")).replace('"lambertian"', '"ies"\nies = "lamp.ies"')
+    (tmp_path / "d" / "own.toml").write_text(text)
+    study = STUDY.replace("METHOD", "latin").replace("[fields]", 'design = "d/own.toml"\n[fields]', 1)
+    monkeypatch.chdir(tmp_path)
+    file = Path(written(tmp_path, study).name)
+    found = explore.prepare(file, "out")
+    assert [led.ies for led in explore.reopened(Path("out")).design.leds] == [str(lamp)] * 4
+    explore.prepare(file, "out")
+    shutil.copytree("d", "e")
+    file.write_text(study.replace("d/own", "e/own"))
+    (found.folder / explore_folder.STUDY).write_text(file.read_text())
+    explore.prepare(file, "out")  # the same, elsewhere
+    lamp.with_name("lamp.ies").write_text(file_of(angles, np.zeros(1), np.array([100.0, 5.0, 0.0])))
+    file.write_text(study)
+    (found.folder / explore_folder.STUDY).write_text(study)
+    with pytest.raises(DesignError, match=r"--out: .*another sensor \(leds\.0\.ies"):
+        explore.prepare(file, "out")
 
 
 def test_another_emulator_does_not_get_the_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -143,8 +143,7 @@ def write(folder: Path, text: str, design: Design, said: Head) -> None:
     """Write what a folder says of its exploration, the study last: with it the exploration has begun."""
     secret = said.storage is not None and hidden(said.storage) != said.storage
     with usable("--out", folder):
-        if not (folder / STUDY).exists():
-            _replace(folder / BASE, design_toml(design))
+        _replace(folder / BASE, design_toml(design))
         _replace(folder / HEAD, json.dumps(vars(said), indent=1) + "\n", 0o600 if secret else 0o666)
         _replace(folder / STUDY, text)
 
