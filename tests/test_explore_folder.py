@@ -190,6 +190,20 @@ def test_one_that_was_cut_off_before_it_had_begun_goes_on(tmp_path: Path) -> Non
     assert prepared(tmp_path) == found
 
 
+def test_processes_may_begin_one_folder_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One comes while the other is opening the storage."""
+    opened, both = explore.opened, []
+
+    def late(made: explore.Exploration) -> object:
+        if not both:
+            both.append(made)
+            both.append(prepared(tmp_path))
+        return opened(made)
+
+    monkeypatch.setattr(explore, "opened", late)
+    assert prepared(tmp_path) == both[1]
+
+
 def test_workers_run_nothing_of_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A stranger's study may come with a file called like a module; the worker gets to its empty DIR."""
     (tmp_path / "tomllib.py").write_text("open('ran', 'w').close()\nraise SystemExit(3)\n")

@@ -110,11 +110,11 @@ def check_same(folder: Path, before: Head, now: Head, design: Design) -> None:
 
 def _told(design: Design, said: Head) -> dict[str, Any]:
     """Values of a design as they are compared: luminaires by what they say where that is known."""
-    tables = tables_of(design)
+    tables, lamps = tables_of(design), dict(enumerate(said.luminaires or ()))
     del tables["description"]
     for number, led in enumerate(tables["leds"]):
         if led["ies"] is not None:
-            led["ies"] = said.luminaires[number] if said.luminaires else ies.digest(led["ies"])
+            led["ies"] = lamps.get(number) or ies.digest(led["ies"])
     return flat(tables)
 
 
@@ -124,10 +124,12 @@ def making(folder: Path) -> Iterator[None]:
     made: list[Path] = []
     try:
         with usable("--out", folder):
-            for place in (*reversed(folder.parents), folder, folder / TRIALS, folder / WORKERS):
+            for place in (*reversed(folder.parents), folder, folder / WORKERS, folder / TRIALS):
                 if not place.is_dir():
                     made.append(place)  # first, for a signal may come once it is there
                     place.mkdir(exist_ok=True)
+                if place == folder / WORKERS:  # by which a process beside this one knows whose folder it is
+                    (place / LOCK).touch()
         yield
     except BaseException:
         if folder / WORKERS in made and not (folder / DATABASE).exists():
