@@ -226,7 +226,11 @@ def trial(path: Path) -> str:
     environment = os.environ | {"DRJIT_LIBLLVM_PATH": str(path)}
     try:
         done = subprocess.run(
-            [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=300
+            [sys.executable, "-P", "-c", code],  # -P: whatever the current folder holds
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=300,
         )
     except (OSError, subprocess.TimeoutExpired) as error:
         return str(error)

@@ -139,6 +139,18 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path: Any) -> None:
         assessing._claim(tmp_path / "mine", told)
 
 
+def test_a_place_that_is_no_folder_is_refused_in_one_line(tmp_path: Path) -> None:
+    told = {"model": "a", "corpus": "b", "seed": 0, "format": 1}
+    (tmp_path / "afile").write_text("mine")
+    for out in ("afile", "afile/deeper"):
+        with pytest.raises(DesignError, match=r"--out: .*a folder that can be made"):
+            assessing._claim(tmp_path / out, told)
+    assessing._claim(tmp_path / "cut", told)
+    (tmp_path / "cut" / assessing.SAMPLES / "head.json").write_bytes(b"{")
+    with pytest.raises(DesignError, match=r"--out: .*same model, corpus and seed"):
+        assessing._claim(tmp_path / "cut", told)
+
+
 def test_an_answer_that_is_kept_is_not_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Means of many exposures, asked for later, are put beside the one exposure's answer of before."""
     network = SimpleNamespace(sample=lambda told, frames, count, seed: np.zeros((1, count, 3)))

@@ -118,6 +118,13 @@ def test_trial_survives_a_library_that_aborts(bad: Path) -> None:
     assert llvm.trial(bad) != ""
 
 
+def test_trial_runs_nothing_of_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "ctypes.py").write_text("open('ran', 'w').close()\n")
+    monkeypatch.chdir(tmp_path)
+    assert llvm.trial(tmp_path / "libLLVM.so") != ""
+    assert not (tmp_path / "ran").exists()
+
+
 def test_untested_version_is_tried_once(tmp_path: Path, good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A newer LLVM has to compile a kernel first, and the verdict is remembered."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))

@@ -67,6 +67,15 @@ def test_the_shipped_studies_can_be_explored():
         ("[search]", "[protocol]\nindentation_mm=[40.0]\n[search]", ["protocol.indentation_mm", "40"]),
         ("[search]", '[set]\n"press.tilt_deg" = [1.0, 0.0]\n[search]', ["press.tilt_deg", "(1.0, 0.0)"]),
         ("[search]", '[set]\n"press.position_mm" = [0.0, 2.0]\n[search]', ["press.position_mm", "(0, 0)"]),
+        ("[1, 16]", '["a"]', ["fields.protocol.frames", "'a'", ">= 1 and <= 10000"]),
+        ("[1, 16]", "[[1], {}]", ["fields.protocol.frames", "an integer"]),
+        ("[1, 16]", "[0, -4, 1.5, true, 10000000]", ["fields.protocol.frames", ">= 1 and <= 10000"]),
+        ("{ choices = [1, 16] }", "[20000, 30000]", ["fields.protocol.frames", "<= 10000"]),
+        (
+            '"layout.leds" = [1, 8]',
+            '"layout.arrangement" = { choices = [["around"], {}, 1] }',
+            ["fields.layout.arrangement", "one of around, facing, one side"],
+        ),
     ],
 )
 def test_a_mistake_is_one_line(tmp_path, capsys, before, after, words):
@@ -116,6 +125,8 @@ def test_fields_make_the_sensor_that_they_say():
     assert sides == ["+x", "-x", "+y", "-y", "+x", "-x"]
     assert {led.z_mm for led in made.design.leds} == {-3.0}
     assert made.protocol.frames == 16
+    frames = layout_fields.layout(study, design, {"protocol.frames": 16.0}).protocol.frames
+    assert frames == 16 and isinstance(frames, int)
     on_x = sorted(led.along_mm for led in made.design.leds if led.side == "+x")
     assert on_x == pytest.approx([-6.25, 6.25])
     with pytest.raises(DesignError, match="z_mm"):

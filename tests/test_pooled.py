@@ -3,6 +3,8 @@
 import multiprocessing
 import os
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -71,3 +73,40 @@ def test_nothing_outlives_who_asked(tmp_path: Path, how: signal.Signals) -> None
     assert asking.exitcode is not None
     assert gone(int((tmp_path / "0").read_text()))
     assert not (tmp_path / "1").exists()
+
+
+COMMAND = """
+import sys
+from twin import __main__, cli, pooled
+
+def begin():
+    pass
+
+def fake():
+    pooled.each(print, ["worked"], 1, begin, lambda count: None)
+    return 0
+
+if __name__ == "__main__":
+    cli.main = fake
+    sys.exit(__main__.main())
+"""
+
+
+def test_processes_run_nothing_of_the_current_folder(tmp_path: Path) -> None:
+    """The command lies elsewhere, as the installed one does; its current folder has a file like a module."""
+    (tmp_path / "bin").mkdir()
+    (tmp_path / "bin" / "twin_command.py").write_text(COMMAND)
+    (tmp_path / "strange").mkdir()
+    (tmp_path / "strange" / "pickle.py").write_text("open('ran', 'w').close()\nraise SystemExit(3)\n")
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONSAFEPATH"}
+    root = str(Path(__file__).resolve().parent.parent)
+    done = subprocess.run(
+        [sys.executable, str(tmp_path / "bin" / "twin_command.py")],
+        cwd=tmp_path / "strange",
+        env=environment | {"PYTHONPATH": root},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 0 and "worked" in done.stdout, done.stderr
+    assert not (tmp_path / "strange" / "ran").exists()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 
 from twin import interrupt
@@ -9,6 +10,9 @@ from twin import interrupt
 
 def main() -> int:
     """Run the command line and return its exit status."""
+    # A spawned process looks for modules in the current folder first, before it hears where this one looks: a
+    # pickle.py in a folder of somebody else's would run.
+    os.environ["PYTHONSAFEPATH"] = "1"
     try:
         with interrupt.guarded():
             from twin import cli

@@ -31,6 +31,7 @@ from twin.estimator_file import load_estimator, without_luminaires
 from twin.fields import flat, tables_of
 from twin.pooled import each
 from twin.report import write_json
+from twin.stage import usable
 from twin.train import TEST, level_names, single
 
 SAMPLES, RECORD, PICTURE = "samples", assessing_report.ASSESSMENT, assessing_report.ASSESSED
@@ -170,15 +171,20 @@ def free(folder: Path) -> bool:
 def _claim(folder: Path, told: Mapping[str, Any]) -> None:
     """Make the folder, or go on with one that was made for the same model, corpus and seed."""
     head = folder / SAMPLES / "head.json"
-    if head.is_file():
-        if json.loads(head.read_bytes()) != told:
-            allowed = "a new folder, or that of the same model, corpus and seed"
-            raise DesignError("--out", shown(str(folder)), allowed)
-        return
-    if not free(folder):
-        raise DesignError("--out", shown(str(folder)), "a new or empty folder")
-    head.parent.mkdir(parents=True, exist_ok=True)
-    write_json(head, told)
+    with usable("--out", folder):
+        if head.is_file():
+            try:
+                same = json.loads(head.read_bytes()) == told
+            except ValueError:  # cut off, or no text at all
+                same = False
+            if not same:
+                allowed = "a new folder, or that of the same model, corpus and seed"
+                raise DesignError("--out", shown(str(folder)), allowed)
+            return
+        if not free(folder):
+            raise DesignError("--out", shown(str(folder)), "a new or empty folder")
+        head.parent.mkdir(parents=True, exist_ok=True)
+        write_json(head, told)
 
 
 def _done(task: Task) -> bool:

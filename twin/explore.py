@@ -8,26 +8,24 @@ what a dead one had under way is found by that and tried again.
 from __future__ import annotations
 
 import itertools
-import json
-import os
-import re
 import shutil
-import uuid
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import fem
 from scenes.sensor import NotModelled
 from twin import evaluate as judging
-from twin import explored, layout_fields, learned, presses, proposals
+from twin import explore_folder, explored, layout_fields, learned, presses, proposals
 from twin.alive import alive, locked
 from twin.complaint import DesignError, shown
 from twin.design import Design, load_design, shipped_designs
 from twin.evaluate import Bench, Evaluation, Layout
+from twin.explore_folder import BASE, BASELINE, DATABASE, KEPT, STUDY, TRIALS, WORKERS
+from twin.explore_folder import HEAD as HEAD
 from twin.kept import Kept
 from twin.layout_study import Axis, LayoutStudy, Limit, Source, limits, load, parse
 from twin.proposals import grid_size
@@ -35,8 +33,6 @@ from twin.proposals import grid_size
 if TYPE_CHECKING:
     import optuna
 
-STUDY, BASE, HEAD, DATABASE = "study.toml", "base.toml", "explore.json", "study.db"
-TRIALS, BASELINE, KEPT, WORKERS = "trials", "baseline", "kept", "workers"
 LOST_S = 3600.0
 """After so long a trial of another machine, of which no lock can be seen, counts as lost."""
 
@@ -93,44 +89,34 @@ def prepare(
     DesignError
         In one line: for a study that cannot be, another study's folder, a storage that cannot be opened.
     """
-    source = load(study)
-    found = checked(source, trials, emulator)
-    folder = Path(out)
-    if (folder / STUDY).exists():
-        if (folder / STUDY).read_text(encoding="utf-8") != source.text:
-            raise DesignError("--out", shown(str(folder)), "a new folder, or that of the same study file")
-        before = json.loads((folder / HEAD).read_text(encoding="utf-8"))
-        storage = storage or before["storage"]
-        if emulator is None and before["emulator"]:
-            found = checked(source, trials, before["emulator"])
-        trials = trials or before["trials"]
-    elif folder.exists() and any(folder.iterdir()):
-        raise DesignError("--out", shown(str(folder)), "a new or empty folder, or one that explore made")
-    folder.mkdir(parents=True, exist_ok=True)
-    for name in (TRIALS, WORKERS):
-        (folder / name).mkdir(exist_ok=True)
-    url = storage or f"sqlite:///{(folder / DATABASE).resolve()}"
-    number = trials or found.trials
-    head = {
-        "storage": storage,
-        "trials": number,
-        "emulator": None if found.emulator is None else str(found.emulator.resolve()),
-    }
-    _replace(folder / BASE, explored.design_toml(found.design))
-    _replace(folder / HEAD, json.dumps(head, indent=1) + "\n")
-    _replace(folder / STUDY, source.text)
-    made = Exploration(folder, found.study, found.design, url, number, found.emulator)
-    _enqueue(made, opened(made))
+    source, folder = load(study), Path(out)
+    before = explore_folder.earlier(folder, source.text)
+    if before is None:
+        found = checked(source, trials, emulator)
+    else:
+        storage, trials = storage or before.storage, trials or before.trials
+        found = checked(source, trials, emulator or before.emulator)
+        if emulator is None and before.emulator is None:  # one that came since would judge otherwise
+            found = replace(found, emulator=None)
+    url = storage or explore_folder.own_database(folder)
+    made = replace(found, folder=folder, url=url, trials=trials or found.trials)
+    head = explore_folder.head_of(made.design, storage, made.trials, made.emulator)
+    if before is not None:
+        explore_folder.check_same(folder, before, head, made.design)
+    with explore_folder.making(folder):
+        optuna_study = opened(made)
+        explore_folder.write(folder, source.text, made.design, head)
+    _enqueue(made, optuna_study)
     return made
 
 
 def reopened(folder: Path) -> Exploration:
     """Return the exploration of a folder that `prepare` made."""
     study = parse((folder / STUDY).read_text(encoding="utf-8"), str(folder / STUDY))
-    head = json.loads((folder / HEAD).read_text(encoding="utf-8"))
-    url = head["storage"] or f"sqlite:///{(folder / DATABASE).resolve()}"
-    emulator = Path(head["emulator"]) if head["emulator"] else None
-    return Exploration(folder, study, load_design(folder / BASE), url, head["trials"], emulator)
+    head = explore_folder.head(folder)
+    url = head.storage or explore_folder.own_database(folder)
+    emulator = Path(head.emulator) if head.emulator else None
+    return Exploration(folder, study, load_design(folder / BASE), url, head.trials, emulator)
 
 
 def checked(source: Source, trials: int | None, emulator: str | Path | None) -> Exploration:
@@ -212,7 +198,7 @@ def opened(exploration: Exploration) -> optuna.Study:
     study = exploration.study
     try:
         options = {"connect_args": {"timeout": 120}} if exploration.url.startswith("sqlite") else {}
-        with locked(exploration.folder / WORKERS / "storage.lock"):
+        with locked(exploration.folder / WORKERS / explore_folder.LOCK):
             storage = optuna.storages.RDBStorage(exploration.url, engine_kwargs=options)
             return optuna.create_study(
                 storage=storage,
@@ -221,9 +207,12 @@ def opened(exploration: Exploration) -> optuna.Study:
                 load_if_exists=True,
             )
     except Exception as error:  # SQLAlchemy's and its drivers' many ways to say no
-        reason = " ".join(str(error).split())[:120]
+        place = explore_folder.hidden(exploration.url)
+        reason = " ".join(str(error).replace(exploration.url, place).split())[:120]
+        if exploration.url == explore_folder.own_database(exploration.folder):
+            received = f"{shown(str(exploration.folder))}, whose {DATABASE} does not open ({reason})"
+            raise DesignError("--out", received, "a folder whose database Optuna opens") from None
         allowed = "a URL that SQLAlchemy opens (sqlite:///FILE, postgresql://..., mysql+pymysql://...)"
-        place = re.sub("(?<=:)[^:/@]+(?=@)", "***", exploration.url)  # without the password
         raise DesignError("--storage", f"{place} ({reason})", allowed) from None
 
 
@@ -376,12 +365,6 @@ def _enqueue(exploration: Exploration, optuna_study: optuna.Study) -> None:
         for number, values in enumerate(planned(exploration)):
             if number not in there:
                 optuna_study.enqueue_trial(values, user_attrs={"planned": number})
-
-
-def _replace(path: Path, text: str) -> None:
-    part = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}")
-    part.write_text(text, encoding="utf-8")
-    os.replace(part, path)
 
 
 def _give_back() -> None:

@@ -160,7 +160,8 @@ def _presses(exploration: Exploration) -> float:
 def _start(folder: Path, number: int) -> subprocess.Popen[bytes]:
     threads = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
     log = (folder / explore.WORKERS / f"{number}.log").open("wb")
-    command = [sys.executable, "-m", "twin.explore_crew", str(folder), str(os.getpid())]
+    # -P: a study's folder, where people stand, may hold a file called like a module
+    command = [sys.executable, "-P", "-m", "twin.explore_crew", str(folder), str(os.getpid())]
     with log:
         return subprocess.Popen(command, env={**os.environ, **threads}, stdout=log, stderr=log)
 

@@ -80,8 +80,12 @@ def read(folder: Path) -> dict[str, Any] | None:
 
 
 def design_toml(design: Design) -> str:
-    """Return a design as the TOML that `twin simulate` reads."""
-    text = _toml(tables_of(design), "")
+    """Return a design as the TOML that `twin simulate` reads, wherever it is put."""
+    tables = tables_of(design)
+    for led in tables["leds"]:
+        if led["ies"] is not None:
+            led["ies"] = str(Path(led["ies"]).resolve())
+    text = _toml(tables, "")
     tomllib.loads(text)
     return text
 

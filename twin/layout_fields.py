@@ -20,8 +20,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from pydantic import TypeAdapter, ValidationError
 
-from twin.complaint import DesignError, shown
+from twin.complaint import DesignError, from_validation, shown
 from twin.design import Design, parse_design
 from twin.evaluate import Layout, optical_key
 from twin.fields import tables_of
@@ -121,8 +122,6 @@ def layout(study: LayoutStudy, design: Design, values: Mapping[str, Value]) -> L
     made = changed_design(design, {**study.set, **fields}, "fields")
     protocol = study.use(made.press.indentation_mm)
     if "protocol.indentation_mm" in wanted or "protocol.positions_mm" in wanted:
-        from pydantic import TypeAdapter, ValidationError
-
         given = {
             name.removeprefix("protocol."): wanted[name]
             for name in ("protocol.indentation_mm", "protocol.positions_mm")
@@ -138,8 +137,19 @@ def layout(study: LayoutStudy, design: Design, values: Mapping[str, Value]) -> L
         if "positions_mm" in given:
             protocol = replace(protocol, positions_mm=use.positions_mm)
     if "protocol.frames" in wanted:
-        protocol = replace(protocol, frames=int(wanted["protocol.frames"]))
+        protocol = replace(protocol, frames=_frames(wanted["protocol.frames"]))
     return Layout(made, protocol, dict(values))
+
+
+def _frames(value: Any) -> int:
+    """The number of exposures that a value stands for, as a study's `[protocol]` may say it."""
+    whole_number = int(value) if isinstance(value, float) and value.is_integer() else value
+    kind = TypeAdapter(Use)
+    given = {"frames": whole_number}
+    try:
+        return kind.validate_json(json.dumps(given), strict=True).frames
+    except ValidationError as error:
+        raise from_validation(error, given, kind.json_schema()).renamed("fields.protocol.frames") from None
 
 
 def axes_of(study: LayoutStudy) -> dict[str, Axis]:
@@ -213,7 +223,7 @@ def _arrange(tables: dict[str, Any], name: str, fields: Mapping[str, Any]) -> No
         if not isinstance(count, int) or isinstance(count, bool) or not 1 <= count <= 64:
             raise DesignError("fields.layout.leds", shown(count), "an integer >= 1 and <= 64")
         way = fields.get("layout.arrangement", "around")
-        if way not in _SIDES:
+        if not isinstance(way, str) or way not in _SIDES:
             raise DesignError("fields.layout.arrangement", shown(way), f"one of {', '.join(_SIDES)}")
         tables["leds"] = _placed(tables["leds"][0], count, _SIDES[way], tables["waveguide"]["width_mm"])
     elif name == "layout.power_W":

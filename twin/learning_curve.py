@@ -25,6 +25,7 @@ from twin.estimator import Estimator
 from twin.estimator_file import load_estimator
 from twin.fitting import fit
 from twin.report import BLUE, GREY, RED, panels, write_json
+from twin.stage import usable
 from twin.train import Seen, gather, learn_light, level_names, of_levels
 
 RECORD, PICTURE = assessing_report.CURVE, assessing_report.CURVED
@@ -56,10 +57,11 @@ def curve(
         received = f"{len(sizes_mm)} samples"
         allowed = f"{tested + SIZES[0]} or more, {tested} of them inclusions of {LEAST_MM:g} mm and more"
         raise DesignError("samples", received, allowed, source=source.name)
-    if not free(folder):
-        raise DesignError("--out", shown(str(folder)), "a new or empty folder, or that of an assessment")
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / KEPT).touch()
+    with usable("--out", folder):
+        if not free(folder):
+            raise DesignError("--out", shown(str(folder)), "a new or empty folder, or that of an assessment")
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / KEPT).touch()
     seen = gather(source, estimator.chain.emulator, folder, lambda share: progress("pictures", share))
     seen = Seen(
         seen.numbers,

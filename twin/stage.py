@@ -35,6 +35,16 @@ def staged(out: str | Path, is_ours: Callable[[Path], bool]) -> Iterator[Path]:
 
 
 @contextmanager
+def usable(field: str, folder: str | Path) -> Iterator[None]:
+    """Say as a `DesignError` about ``field`` what the system has against a folder that the block uses."""
+    try:
+        yield
+    except OSError as error:
+        allowed = f"a folder that can be made, read and written ({_reason(error)})"
+        raise DesignError(field, shown(str(folder)), allowed) from None
+
+
+@contextmanager
 def staged_file(name: str, field: str, suffix: str) -> Iterator[Path]:
     """Yield the path to write a file at, which takes its place when the block ends well; see `staged`.
 
