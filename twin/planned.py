@@ -335,8 +335,7 @@ def design_in(tables: dict[str, Any], folder: Path) -> Design:
             {**led, "ies": str(folder / led["ies"])} if isinstance(led, dict) and led.get("ies") else led
             for led in leds
         ]
-    found = parse_design({**tables, "leds": leds})
-    return found
+    return parse_design({**tables, "leds": leds})
 
 
 def _head(place: Path, source: str) -> Head:
