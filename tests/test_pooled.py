@@ -26,6 +26,10 @@ def fail(place: Path) -> None:
     raise ValueError(place.name)
 
 
+def die(place: Path) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
 def nothing() -> None:
     pass
 
@@ -57,6 +61,11 @@ def test_every_task_is_done(tmp_path: Path) -> None:
 def test_what_goes_wrong_is_raised(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="bad"):
         each(fail, [tmp_path / "bad"], 1, nothing, lambda count: None)
+
+
+def test_a_process_that_is_killed_is_said_in_one_line(tmp_path: Path) -> None:
+    with pytest.raises(ChildProcessError, match="ended from outside"):
+        each(die, [tmp_path / "a"], 1, nothing, lambda count: None)
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])

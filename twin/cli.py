@@ -84,8 +84,9 @@ def main(argv: list[str] | None = None) -> int:
     except (DesignError, fem.NotModelled, fem.NotConverged, NotModelled, BackendError) as error:
         return _fail(name, _with_flags(str(error)), 2)
     except KeyboardInterrupt:
-        kept = "what is finished stays" if arguments.verb in _RESUMED else "nothing was written"
-        return _fail(name, f"interrupted; {kept}", 130)
+        return _fail(name, f"interrupted; {_left_by(arguments.verb)}", 130)
+    except ChildProcessError as error:
+        return _fail(name, f"{error}; {_left_by(arguments.verb)}", 1)
     except BrokenPipeError:  # `twin schema | head`
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115 (Python flushes it on its way out)
         return 0
@@ -97,6 +98,10 @@ def main(argv: list[str] | None = None) -> int:
         if not type(error).__module__.startswith(_ROOMS):  # a mistake of this program: show where
             raise
         return _fail(name, str(error), 1 if isinstance(error.__cause__, OSError) else 2)
+
+
+def _left_by(verb: str) -> str:
+    return "what is finished stays" if verb in _RESUMED else "nothing was written"
 
 
 def _run(arguments: argparse.Namespace) -> int:

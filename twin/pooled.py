@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from typing import Any, TypeVar
 
 Task = TypeVar("Task")
@@ -25,7 +26,7 @@ def each(
     """Call ``work`` with every task, in so many processes, and ``tell`` how many are done.
 
     ``begin`` is called in every process first. Where something is raised, an interruption too, the processes
-    are ended at once: ``work`` leaves nothing half-written.
+    are ended at once: ``work`` leaves nothing half-written. A process that is killed raises ChildProcessError.
     """
     pool = ProcessPoolExecutor(
         max(workers, 1), multiprocessing.get_context("spawn"), _begin, (os.getpid(), begin)
@@ -35,6 +36,8 @@ def each(
             for count, one in enumerate(as_completed([pool.submit(work, task) for task in tasks]), start=1):
                 one.result()
                 tell(count)
+        except BrokenProcessPool:
+            raise ChildProcessError("a worker process was ended from outside, perhaps for memory") from None
         except BaseException:
             processes = list((pool._processes or {}).values())  # Python 3.14 has terminate_workers
             pool.shutdown(wait=False, cancel_futures=True)
