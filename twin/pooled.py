@@ -26,7 +26,7 @@ def each(
     """Call ``work`` with every task, in so many processes, and ``tell`` how many are done.
 
     ``begin`` is called in every process first. Where something is raised, an interruption too, the processes
-    are ended at once: ``work`` leaves nothing half-written. A process that is killed raises ChildProcessError.
+    are ended at once: ``work`` leaves nothing half-written. Raises ChildProcessError where one is killed.
     """
     pool = ProcessPoolExecutor(
         max(workers, 1), multiprocessing.get_context("spawn"), _begin, (os.getpid(), begin)
