@@ -201,7 +201,7 @@ def exact(
     relief = wander.Relief.on(ground.height_mm, sensor.guide.width_mm)
     lump = None if place is None else wander.Lump.of(sensor, place)
     least = sensor.guide.under_contact_mm(1.0)
-    squeezed = (sensor.guide.refractive_index / sensor.tissue.refractive_index) ** 2
+    squeezed = (sensor.guide.refractive_index / wander.behind(sensor)) ** 2
 
     # nothing is in the glass, and what leaves it is gone: down and up again at one go
     in_one = not sensor.housing.reflects and all(led.side != "below" for led in sensor.leds)

@@ -143,6 +143,7 @@ def angular_basis(
     for m, (ways, spread) in enumerate(zip(coupling.ways, apart.transforms, strict=True)):
         if len(ways):
             counts = np.abs(spread[STEEP]).max(axis=-1) / largest / turning
+            counts = np.maximum(counts, 1e-6)  # 0 in a clear sheet, whose light only its backing gives back
             if m == 0:
                 counts[:modes] = 1.0 / tolerance
             products = (counts[:, None] * ways)[:, None] * optics.transmittance
@@ -153,9 +154,9 @@ def angular_basis(
 
 
 def _separated(products: Array, tolerance: float) -> tuple[Array, Array]:
-    """Rows and columns whose product is within a tolerance."""
+    """Rows and columns, one or more, whose product is within a tolerance."""
     u, s, v = np.linalg.svd(products, full_matrices=False)
-    for count in range(s.size + 1):
+    for count in range(1, s.size + 1):
         rows, columns = u[:, :count] * s[:count], v[:count]
         if np.abs(rows @ columns - products).max() <= tolerance:
             break

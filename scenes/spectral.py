@@ -182,8 +182,10 @@ def _mean(radiance: NDArray[np.float64]) -> float:
 
 
 def _alight(sensor: Sensor, band: Band) -> tuple[int, ...]:
-    """The LEDs to put into a band's scene: those that shine, and those that stand in the way of light."""
-    if all(led.coupling == "air" and led.side != "below" for led in sensor.leds):
+    """The LEDs to put into a band's scene: those that shine, and those that stand in the way of light or have
+    a window in painted walls."""
+    clear = sensor.guide.walls == "polished"
+    if clear and all(led.coupling == "air" and led.side != "below" for led in sensor.leds):
         return band.leds
     return tuple(range(len(sensor.leds)))
 

@@ -35,6 +35,7 @@ MODES = 2
 _COSINES = 513
 _CAMERA = 0.985  # cosine in the tissue at which mode 1 is exact: about what the camera sees
 _LEAST = 1e-12  # reflectance below which nothing comes back
+_NOTHING = 1e-6  # of it, below which a mode is rounding
 
 
 @dataclass(frozen=True)
@@ -155,6 +156,10 @@ def tissue_optics(
     for number in range(1, modes):
         values, vectors = np.linalg.eigh(0.5 * (nodes + nodes.T) * np.outer(root, root))
         largest = int(np.argmax(np.abs(values)))
+        if abs(values[largest]) < _NOTHING * total:  # as in a clear sheet, which remembers nothing
+            strengths.append(0.0)
+            shapes.append(np.zeros(_COSINES))
+            continue
         strength, on_nodes = values[largest], vectors[:, largest] / root
         on_grid = out @ (even * on_nodes) / strength
         norm = even @ nodes[:, camera] ** 2

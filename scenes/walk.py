@@ -23,9 +23,10 @@ Passing = Callable[[mi.Point3f, mi.Float], mi.Float]
 """Transmittance of the face at points (z = 0) for light from inside at a cosine, both on the device."""
 Scores = tuple[mi.Float, ...]
 """Of each parameter the derivative of the logarithm of a path's density."""
-Witness = Callable[[mi.Point3f, mi.Vector3f, mi.Float, mi.Float, mi.Bool, Scores], None]
-"""Told of every collision: where, direction before it, share of the light after it, mean cosine g, which
-lanes collide, and the scores so far."""
+Witness = Callable[[mi.Point3f, mi.Vector3f, mi.Float, mi.Float, mi.Bool, mi.Bool, Scores], None]
+"""Told of every collision and of light that the backing throws back: where, direction before it, share of the
+light after it, mean cosine g, in which lanes, in which of these it is the backing (a Lambertian plane), and
+the scores so far."""
 Scoring = Callable[[mi.Point3f, mi.Float, mi.Bool, mi.Bool], Scores]
 """What a meeting with the face adds to scores: where, cosine, whether light leaves, and which lanes meet."""
 
@@ -255,7 +256,8 @@ def roam(
         collides = ~meets & (u3 < chance)
         weight = dr.select(collides, weight * share, weight)
         if witness is not None:
-            witness(where, direction, weight, mean, alive & collides, scores)
+            backed = alive & at_bottom & (body.backing > 0.0)
+            witness(where, direction, weight, mean, backed | (alive & collides), backed, scores)
         if scoring is not None:
             more = scoring(where, -sinks, leaves, alive & at_face)
             scores = tuple(one + new for one, new in zip(scores, more, strict=True))

@@ -198,7 +198,8 @@ def wander(
     scores: Scores = (),
     lump: Lump | None = None,
 ) -> tuple[mi.Ray3f, mi.Float, mi.PCG32, Scores]:
-    """Follow light that enters where it `met` the contact until it leaves; views see every collision.
+    """Follow light that enters where it `met` the contact until it leaves; views see every collision, and
+    what a sheet's backing throws back.
 
     Returns
     -------
@@ -227,7 +228,13 @@ def wander(
         return tuple(dr.select(meets, one, 0.0) for one in added)
 
     def witness(
-        where: mi.Point3f, way: mi.Vector3f, share: mi.Float, g: mi.Float, collides: mi.Bool, so_far: Scores
+        where: mi.Point3f,
+        way: mi.Vector3f,
+        share: mi.Float,
+        g: mi.Float,
+        shines: mi.Bool,
+        backed: mi.Bool,
+        so_far: Scores,
     ) -> None:
         depth, normal = relief.at(where)
         for view in views:
@@ -239,16 +246,17 @@ def wander(
             up = dr.safe_sqrt(1.0 - dr.squared_norm(along))
             aim, run = along - up * normal, depth / dr.maximum(up, 1e-6)
             leaves, _ = relief.onto(where + run * aim)
-            through, slope = table.steep(spots.at(leaves), away, collides)
+            through, slope = table.steep(spots.at(leaves), away, shines)
             dense = extinction * run
             if lump is not None:
                 dense += more * run * lump.share(where, leaves)
-            amount = throughput * share * phase(g, dr.dot(way, aim)) * dr.exp(-dense) / up
+            per_sr = dr.select(backed, up * dr.inv_pi, phase(g, dr.dot(way, aim)))
+            amount = throughput * share * per_sr * dr.exp(-dense) / up
             # a pixel sees more of what lies deeper; its radiance is that of the area it sees at the face
             amount *= away * length * dr.square(1.0 - view.spread_per_mm * index * dr.maximum(depth, 0.0))
             changes = zip(so_far, spots.derivatives(leaves), strict=True)
             slopes = [amount * (through * score + slope * change) for score, change in changes]
-            seen = collides & (away > 0.0) & (up > 0.0) & spots.covers(leaves)
+            seen = shines & (away > 0.0) & (up > 0.0) & spots.covers(leaves)
             view.add(number, leaves, [amount * through, *slopes], seen)
 
     start, normal = relief.onto(met.p)

@@ -211,6 +211,7 @@ def test_words_are_of_the_sizes_that_were_held_out() -> None:
     ("changes", "word"),
     [
         ({"camera": {"frames": 4}}, "camera.frames: received 4"),
+        ({"camera": {"ambient": 0.2}}, "camera.ambient: received 0.2"),
         ({"camera": {"exposure_ms": 3.5}}, "camera.exposure_ms: received 3.5"),
         ({"leds": {"z_mm": -4.0}}, "leds.0.z_mm: received -4.0"),
         ({"specimen": {"modulus_kPa": 6.0}}, None),

@@ -1,11 +1,14 @@
 """Layout studies: what is refused, in one line; what fields mean; what kind each one is."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 import twin
-from twin import explore, layout_fields
+from twin import evaluate, explore, explore_leds, layout_fields
+from twin.bench import optical_key
 from twin.cli import main
 from twin.complaint import DesignError
 from twin.design import parse_design
@@ -137,6 +140,43 @@ def test_a_trial_is_pressed_as_deep_as_the_studys_own_design():
     study, design = parse(TEXT + '[set]\n"press.indentation_mm" = [1.0]\n'), twin.load_design("tsis")
     assert layout_fields.base(study, design).protocol.indentation_mm == (1.0,)
     assert layout_fields.layout(study, design, {}).protocol.indentation_mm == (1.0,)
+
+
+def test_a_protocol_that_says_nothing_of_exposures_takes_the_designs():
+    study, design = parse(TEXT + '[set]\n"camera.frames" = 100\n'), twin.load_design("tsis")
+    assert layout_fields.base(study, design).protocol.frames == 100
+    assert layout_fields.layout(study, design, {}).protocol.frames == 100
+    assert layout_fields.layout(study, design, {"protocol.frames": 4}).protocol.frames == 4
+
+
+def test_the_light_of_layered_guides_is_kept_apart():
+    """Layers of other index are not in the guide's own words, by which light is kept."""
+    design = twin.load_design("tsis")
+
+    def key(index: float | None):
+        layers = design.waveguide.layers
+        guide = replace(
+            design.waveguide, layers=(layers[0], replace(layers[1], refractive_index=index), layers[2])
+        )
+        return repr(optical_key(replace(design, waveguide=guide)))
+
+    assert len({key(None), key(1.38), key(1.5)}) == 3
+
+
+def test_exposures_leave_room_for_stray_light():
+    """As bright again as the LEDs: together they fill the share of the range that is asked for."""
+    design = twin.load_design("tsis")
+    light = 0.2 + np.zeros((1, len(design.leds), *design.camera.shape))
+    stray = replace(design, camera=replace(design.camera, ambient=float(light[0, :, 0, 0].sum())))
+    alone, both = (evaluate._exposed(one, one, 0.8, [light]) for one in (design, stray))
+    assert both.camera.exposure_ms == pytest.approx(alone.camera.exposure_ms / 2, rel=2e-3)
+
+
+def test_a_failed_led_has_no_settings(monkeypatch):
+    lamps = [SimpleNamespace(count=2, flux_W=np.array([0.01, 0.0]))]
+    monkeypatch.setattr(explore_leds.lamps, "lamps_of", lambda evaluation: lamps)
+    one = SimpleNamespace(names=("size_mm", "camera.gain_e_per_dn"), layer_jacobian=np.zeros(1))
+    assert explore_leds.findings(SimpleNamespace(judged=[one])) is None
 
 
 def test_layers_of_their_own_index_are_not_dropped_in_silence():

@@ -167,7 +167,7 @@ def test_energy_closes_with_a_lump(variant: str) -> None:
     total = dr.zeros(mi.Int64, 2)
     losses = [one.absorption_per_mm / one.scattering_per_mm for one in (lump.medium, medium)]
 
-    def witness(where: Any, way: Any, share: Any, g: Any, collides: Any, scores: Any) -> None:
+    def witness(where: Any, way: Any, share: Any, g: Any, collides: Any, backed: Any, scores: Any) -> None:
         inside = body.ball.holds(where)
         lost = share * dr.select(inside, *losses)
         place = dr.select(inside, mi.UInt32(0), mi.UInt32(1))

@@ -11,6 +11,7 @@ from scenes import dispersion
 from scenes.camera import LIGHT_SPEED_M_S, PLANCK_J_S, mean_electrons
 from scenes.led import Led
 from scenes.sensor import Sensor
+from scenes.spectral import band_sensors
 from scenes.spectrum import ILLUMINANTS, bands, efficacy, longest, luminous_efficiency, shape
 
 RGB = {
@@ -161,6 +162,17 @@ def test_camera_blind_to_an_led_sees_it_dark() -> None:
     (band,) = bands(sensor.leds, sensor.camera, 550.0, 3)
     assert not band.share.any() and band.leds == (0,)
     assert longest(sensor.leds, 550.0) == 850.0
+
+
+def test_painted_walls_keep_the_windows_of_leds_of_other_colours() -> None:
+    """An LED in air has its window in the paint whatever colour shines just now."""
+    base = sensor_of({"peak_nm": 466.0}, {"peak_nm": 625.0}, colour="rgb", quantum_efficiency=RGB)
+    painted = dataclasses.replace(base, guide=dataclasses.replace(base.guide, walls="diffuse"))
+    for sensor, count in ((base, 1), (painted, 2)):
+        parts = band_sensors(sensor)
+        assert [len(one.leds) for _, _, one in parts] == [count, count]
+    dark = [[led.flux_W == 0.0 for led in one.leds] for _, _, one in parts]
+    assert dark == [[False, True], [True, False]]
 
 
 def test_light_that_the_camera_is_blind_to_is_followed_all_the_same(variant: str) -> None:

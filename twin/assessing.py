@@ -32,7 +32,7 @@ from twin.fields import flat, tables_of
 from twin.pooled import each
 from twin.report import write_json
 from twin.stage import usable
-from twin.train import TEST, level_names, single
+from twin.train import TEST, check_camera, level_names
 
 SAMPLES, RECORD, PICTURE = "samples", assessing_report.ASSESSMENT, assessing_report.ASSESSED
 KEPT = "curve.parts"
@@ -132,7 +132,7 @@ def assess(
 def levels_of(source: Corpus, estimator: Estimator) -> list[int]:
     """Numbers of the corpus's press levels that the model wants; raises `DesignError` for other sensors, and
     for pictures that are means of exposures."""
-    single(source)
+    check_camera(source)
     design, card = source.design, estimator.card
     names = ("pixels", "LEDs")
     given = (list(source.shape), len(design.leds))

@@ -68,7 +68,9 @@ def optical_key(design: Design) -> tuple[Any, ...]:
     parts = sensor.guide, sensor.glass, sensor.leds, sensor.skin, sensor.tissue, sensor.effective_modulus_kPa
     box = (design.housing,) if design.housing.reflects else ()
     luminaires = [ies.digest(led.ies) for led in sensor.leds if led.ies is not None]
-    return (*seen, camera.colour, response, camera.pixel_um, design.light, *parts, *box, *luminaires)
+    lower = (sensor.guide.lower,) if sensor.guide.lower else ()  # not in the guide's own words
+    own = camera.colour, response, camera.pixel_um, design.light
+    return (*seen, *own, *parts, *box, *lower, *luminaires)
 
 
 @dataclass

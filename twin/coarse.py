@@ -92,7 +92,7 @@ def counted(design: Design, radiance: NDArray[np.floating]) -> Counted:
     camera, per = design.camera, per_radiance(design)
     planes = 2 if camera.colour == "mono" else 3
     layers = _through(design, np.asarray(radiance, np.float64), planes) * per
-    ambient = _ambient(design, planes) * per
+    ambient = stray(design)
     dark = camera.dark_current_e_s * camera.exposure_ms * 1e-3 / camera.gain_e_per_dn
     light = layers.sum(axis=-planes - 1) + ambient + dark
     well = camera.full_well_e / camera.gain_e_per_dn
@@ -129,10 +129,12 @@ def _through(design: Design, fields: Floats, planes: int) -> Floats:
     return np.stack(found).reshape(fields.shape)
 
 
-def _ambient(design: Design, planes: int) -> Floats | float:
-    if design.camera.ambient == 0.0:
+def stray(design: Design) -> Floats | float:
+    """Counts of ambient light, (rows, columns[, 3])."""
+    camera = design.camera
+    if camera.ambient == 0.0:
         return 0.0
     from scenes.lens import through
 
-    shape = design.camera.shape if planes == 2 else (*design.camera.shape, 3)
-    return through(design.sensor(), np.zeros(shape))
+    shape = camera.shape if camera.colour == "mono" else (*camera.shape, 3)
+    return through(design.sensor(), np.zeros(shape)) * per_radiance(design)

@@ -194,7 +194,9 @@ def _exposed(design: Design, small: Design, fill: float, radiance: Sequence[NDAr
     camera = small.camera
     top = min(camera.full_well_e, (2**camera.bits - 1 - camera.offset_dn) * camera.gain_e_per_dn)
     planes = 2 if camera.colour == "mono" else 3
-    layers = [pixels.counted(small, one).layers.sum(axis=-planes - 1) for one in radiance]
+    layers = [
+        pixels.counted(small, one).layers.sum(axis=-planes - 1) + pixels.stray(small) for one in radiance
+    ]
     bright = max(float(np.percentile(one, _BRIGHT)) for one in layers) * camera.gain_e_per_dn
     if bright <= 0.0:
         raise DesignError("leds", "no light that reaches the camera", "LEDs that shine")

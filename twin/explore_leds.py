@@ -28,7 +28,8 @@ _MOST_LEDS = 16
 
 
 def findings(evaluation: Evaluation) -> dict[str, Any] | None:
-    """Return settings of the LEDs and what each is worth; None where there is nothing to re-weight by.
+    """Return settings of the LEDs and what each is worth; None where there is nothing to re-weight by, or an
+    LED that has failed.
 
     Bounds are root mean squares over the inclusions, of `lamps.WANTED` (those that are unknown), in order.
     """
@@ -39,7 +40,7 @@ def findings(evaluation: Evaluation) -> dict[str, Any] | None:
         return None
     given = lamps.lamps_of(evaluation)
     count = given[0].count
-    if count > _MOST_LEDS:
+    if count > _MOST_LEDS or not given[0].flux_W.all():
         return None
     ones = np.ones(count)
     best = lamp_settings.optimise(given, names)

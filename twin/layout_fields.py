@@ -105,7 +105,7 @@ def whole(name: str, design: Design) -> bool:
 def base(study: LayoutStudy, design: Design) -> Layout:
     """The study's own design with its own protocol; raises `DesignError`."""
     changed = changed_design(design, study.set, "set")
-    return Layout(changed, study.use(changed.press.indentation_mm), {})
+    return Layout(changed, study.use(changed), {})
 
 
 def layout(study: LayoutStudy, design: Design, values: Mapping[str, Value]) -> Layout:
@@ -120,7 +120,7 @@ def layout(study: LayoutStudy, design: Design, values: Mapping[str, Value]) -> L
     wanted = {name: meant(name, value, own[name].choices) for name, value in values.items()}
     fields = {name: value for name, value in wanted.items() if name not in PROTOCOL}
     made = changed_design(design, {**study.set, **fields}, "fields")
-    protocol = study.use(made.press.indentation_mm)
+    protocol = study.use(made)
     if "protocol.indentation_mm" in wanted or "protocol.positions_mm" in wanted:
         given = {
             name.removeprefix("protocol."): wanted[name]
@@ -147,9 +147,11 @@ def _frames(value: Any) -> int:
     kind = TypeAdapter(Use)
     given = {"frames": whole_number}
     try:
-        return kind.validate_json(json.dumps(given), strict=True).frames
+        frames = kind.validate_json(json.dumps(given), strict=True).frames
     except ValidationError as error:
         raise from_validation(error, given, kind.json_schema()).renamed("fields.protocol.frames") from None
+    assert frames is not None  # a study's file has no null
+    return frames
 
 
 def axes_of(study: LayoutStudy) -> dict[str, Axis]:

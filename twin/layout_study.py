@@ -16,7 +16,7 @@ from pydantic.dataclasses import dataclass
 
 import fem
 from twin.complaint import DesignError, from_validation, not_finite, shown
-from twin.design import Depth, Offset
+from twin.design import Depth, Design, Offset
 from twin.evaluate import UNKNOWNS, Protocol, check_unknown
 from twin.forward import Unknown
 from twin.objectives import BOUNDS, OBJECTIVES
@@ -66,7 +66,7 @@ class Use:
 
     indentation_mm: Annotated[tuple[Depth, ...] | None, Field(min_length=1, max_length=20)] = None
     positions_mm: Annotated[tuple[Position, ...], Field(min_length=1, max_length=50)] = ((0.0, 0.0),)
-    frames: Annotated[int, Field(ge=1, le=10_000)] = 1
+    frames: Annotated[int | None, Field(ge=1, le=10_000)] = None
 
 
 @dataclass(frozen=True, config=CONFIG)
@@ -140,10 +140,10 @@ class LayoutStudy:
                 raise what.renamed(f"inclusions.{number}.{what.field}") from None
         return tuple(found)
 
-    def use(self, indentation_mm: tuple[float, ...]) -> Protocol:
-        """The protocol where no field says otherwise, from the design's press levels."""
-        levels = self.protocol.indentation_mm or indentation_mm
-        return Protocol(levels, self.protocol.positions_mm, self.protocol.frames)
+    def use(self, design: Design) -> Protocol:
+        """The protocol where no field says otherwise: the design's press levels and exposures."""
+        levels = self.protocol.indentation_mm or design.press.indentation_mm
+        return Protocol(levels, self.protocol.positions_mm, self.protocol.frames or design.camera.frames)
 
 
 @plain(frozen=True)

@@ -199,7 +199,7 @@ def train(
 
 def of_levels(source: Corpus, levels: Sequence[int] | None) -> Design:
     design = source.plan.base
-    single(source)
+    check_camera(source)
     if design.camera.colour != "mono":
         raise DesignError("camera.colour", shown(design.camera.colour), '"mono"', source=source.name)
     if levels is None:
@@ -212,13 +212,16 @@ def of_levels(source: Corpus, levels: Sequence[int] | None) -> Design:
     return replace(design, press=replace(design.press, indentation_mm=depths))
 
 
-def single(source: Corpus) -> None:
-    """Refuse a corpus whose pictures are means of exposures: estimators learn from single ones, and take
-    means of these."""
-    frames = source.design.camera.frames
-    if frames != 1:
+def check_camera(source: Corpus) -> None:
+    """Refuse pictures that are means of exposures, for estimators learn from single ones and take means of
+    these; and stray light, of which they know nothing."""
+    camera = source.design.camera
+    if camera.frames != 1:
         allowed = "1: estimators learn from single exposures"
-        raise DesignError("camera.frames", shown(frames), allowed, source=source.name)
+        raise DesignError("camera.frames", shown(camera.frames), allowed, source=source.name)
+    if camera.ambient > 0.0:
+        allowed = "0: estimators know of no stray light"
+        raise DesignError("camera.ambient", shown(camera.ambient), allowed, source=source.name)
 
 
 def level_names(values: dict[str, float], levels: Sequence[int]) -> dict[str, float]:
