@@ -19,7 +19,7 @@ SHEETS = {
 
 @pytest.mark.parametrize("name", SHEETS)
 def test_all_light_is_the_references(variant: str, name: str) -> None:
-    """What a backing throws back is seen without another scattering, too; radiance is of the sheet's index."""
+    """What a backing throws back is seen without another scattering; radiance is of the sheet's index."""
     from scenes import Renderer
 
     base = paper_sensor("air", columns=96, rows=61, pixel_um=(67.2, 78.4))
