@@ -21,7 +21,7 @@ from fem.meshed import build, moduli
 from fem.model import Inclusion, NotConverged, NotModelled, Pose, Probe, Slab, check
 from fem.path import path
 from fem.solver import one_thread
-from fem.topology import Resolution, materials, probe_topology, slab_topology
+from fem.topology import Layout, Resolution, materials, probe_topology, slab_topology
 from fem.trust import discretisation_error
 
 Floats = NDArray[np.float64]
@@ -99,7 +99,7 @@ class Press:
         """
         state, bare = self._states
         model = state.model
-        of = materials(model.layout)
+        of = _materials(self._geometry, model.layout)
         gradient, weight, where = volume.gradients(model.place, model.nodes.cells, state.moved)
         shear, bulk = moduli(self._geometry, model, True)
         finite = self.mechanics == "finite"
@@ -338,6 +338,12 @@ def _presses(
         raise NotModelled(TOO_UNEVEN) from None
 
 
+def _materials(geometry: Geometry, layout: Layout) -> NDArray[np.int64]:
+    """`materials`; where there is no inclusion, the cells that the mesh keeps for one are tissue."""
+    found = materials(layout)
+    return found if geometry.inclusion is not None else np.where(found == 1, 0, found)
+
+
 def _press(
     geometry: Geometry,
     states: tuple[State, State],
@@ -354,7 +360,7 @@ def _press(
     cut = surface.cut_plane(
         model.place,
         np.vstack([faces, probe_faces + nodes.slab]),
-        materials(layout)[np.concatenate([elements, probe_elements + nodes.slab_cells])],
+        _materials(geometry, layout)[np.concatenate([elements, probe_elements + nodes.slab_cells])],
         {name: s.moved for name, s in zip(("displacement", "displacement_0"), states, strict=True)},
         mirror=layout.symmetric[0],
     )

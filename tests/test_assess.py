@@ -12,7 +12,7 @@ import pytest
 
 from estimation.scalars import scalars
 from twin import ablation, assessing, assessing_report, learning_curve
-from twin.assess import assess, figures, summed_up
+from twin.assess import assess, figures, found_or_not, summed_up
 from twin.assess import words as words_of
 from twin.assessing_figure import draw
 from twin.assessment import answered, record_of, words
@@ -210,6 +210,8 @@ def test_words_are_of_the_sizes_that_were_held_out() -> None:
 @pytest.mark.parametrize(
     ("changes", "word"),
     [
+        ({"varied": {"camera.exposure_ms": 1.0}}, "what varies: received camera.exposure_ms"),
+        ({"varied": {"size_mm": 1.0, "camera.gain_e_per_dn": 1.0}}, None),
         ({"camera": {"frames": 4}}, "camera.frames: received 4"),
         ({"camera": {"ambient": 0.2}}, "camera.ambient: received 0.2"),
         ({"camera": {"exposure_ms": 3.5}}, "camera.exposure_ms: received 3.5"),
@@ -223,13 +225,13 @@ def test_a_corpus_of_another_sensor_is_refused_by_its_first_difference(
 ) -> None:
     """But for what the model knows to vary, and for what pictures do not depend on."""
     own, tables = tables_of(load_design("tsis")), tables_of(load_design("tsis"))
+    varied = changes.pop("varied", {})
     for room, values in changes.items():
         for table in tables[room] if room == "leds" else [tables[room]]:
             table.update(values)
     design = parse_design(tables)
-    source: Any = SimpleNamespace(
-        design=design, name="c", shape=(492, 768), plan=SimpleNamespace(indentation_mm=(1.0, 2.0))
-    )
+    plan = SimpleNamespace(indentation_mm=(1.0, 2.0), columns=varied, name="c")
+    source: Any = SimpleNamespace(design=design, name="c", shape=(492, 768), plan=plan)
     estimator: Any = SimpleNamespace(
         card={"design": own, "shape": [492, 768], "indentation_mm": [1.0, 2.0]},
         chain=SimpleNamespace(design=load_design("tsis")),
@@ -241,6 +243,14 @@ def test_a_corpus_of_another_sensor_is_refused_by_its_first_difference(
     with pytest.raises(DesignError) as caught:
         assessing.levels_of(source, estimator)
     assert word in str(caught.value)
+
+
+def test_inclusions_found_are_told_by_their_size() -> None:
+    """Half of those below 4 mm, all of the others."""
+    truth = np.array([[2.5, 5, 80], [3.5, 5, 80], [5.0, 5, 80], [9.0, 5, 80]])
+    presence = np.array([0.1, 0.9, 0.9, 0.9, 0.2])
+    told = found_or_not(presence, np.array([False] * 4 + [True]), truth)
+    assert told["found_at_5_percent"] == {"2 to 4 mm": 0.5, "4 to 8 mm": 1.0, "8 mm and more": 1.0}
 
 
 def test_information_of_the_scalars_is_that_of_noisy_pictures() -> None:

@@ -83,6 +83,14 @@ def test_cut_shows_the_sphere(pressed: fem.Press) -> None:
     assert cut["Area"].sum() == pytest.approx(30 * 60 + 10 * 25, rel=1e-6)
 
 
+def test_plain_tissue_holds_no_inclusion(pressed: fem.Press) -> None:
+    """Its mesh keeps the cells for one, but their material is tissue, in the cut and in the volume."""
+    plain = press(PROBE, SLAB, None, 1.0, quality="preview")
+    for with_one, without in ((pressed.cut, plain.cut), (pressed.volume(), plain.volume())):
+        assert 1 in with_one.cell_data["material"]
+        assert 1 not in without.cell_data["material"] and {0, 2, 3, 4} == {*without.cell_data["material"]}
+
+
 def test_twice_the_press_twice_the_answer(pressed: fem.Press) -> None:
     twice = press(PROBE, SLAB, BALL, 2.0, quality="preview")
     for name in FIELDS:

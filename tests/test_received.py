@@ -196,6 +196,17 @@ def test_exposures_of_other_presses_are_not_averaged(files):
     assert "counts (rms) from" in line and "one press" in line
 
 
+def test_copies_of_an_exposure_are_no_exposures(given, tmp_path):
+    """They would count as so many, and halve the noise that is believed."""
+    one = write_folders(given, LEVELS, tmp_path / "a")
+    two = write_folders(given, LEVELS, tmp_path / "b")
+    assert "the same picture as" in refused([*one, *two], wanted(SENSOR), exposures=2)
+    images = write_seen_from_below(given.images, tmp_path, "image", 8)
+    plain = write_seen_from_below(given.references, tmp_path, "reference", 8)
+    twice = [place for place in images for _ in range(2)]
+    assert "the same picture as" in refused(twice, wanted(SENSOR), references=plain, exposures=2)
+
+
 def test_saturated_pictures(given, tmp_path):
     bright = np.minimum(given.images * 4, 255)
     images = write_seen_from_below(bright, tmp_path, "image", 8)

@@ -15,7 +15,7 @@ import pytest
 import fem
 import twin
 from estimation import scalars
-from twin.exposure import picture_facts, take
+from twin.exposure import picture_facts, saturated_percent, take
 
 HERE = Path(__file__).resolve().parent
 INCLUSION = twin.Inclusion(size=10, depth=5, modulus=100)
@@ -219,6 +219,14 @@ def test_full_pixels_are_counted(design, levels):
         found = picture_facts(changed, image, levels[1].reference, levels[1].radiance)
         assert found["saturated_percent"] > 90
     assert image.max() < 2**16 - 1
+
+
+def test_a_pixel_is_full_where_one_of_its_channels_is():
+    """Blue full all over, red and green not: all pixels are, not a third."""
+    design = twin.load_design("rgb")
+    image = np.zeros((*design.camera.shape, 3), np.uint16)
+    image[:, : design.camera.columns // 2, 2] = 2**design.camera.bits - 1
+    assert saturated_percent(design, image, np.zeros(image.shape)) == 50.0
 
 
 def test_moduli_too_far_apart_for_the_solver_are_refused_in_one_line(design, monkeypatch):

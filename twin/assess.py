@@ -153,10 +153,10 @@ def found_or_not(presence: Floats, blank: NDArray[np.bool_], truth: Floats) -> d
         return {}
     area = float((full[:, None] > empty).mean() + 0.5 * (full[:, None] == empty).mean())
     line = float(np.percentile(empty, 95.0))
-    sizes = ((2.0, 4.0), (4.0, 8.0), (8.0, 99.0))
+    sizes = (("2 to 4 mm", 2.0, 4.0), ("4 to 8 mm", 4.0, 8.0), ("8 mm and more", 8.0, np.inf))
     found = {
-        f"{low:g} mm and more": float((full[(truth[:, 0] >= low) & (truth[:, 0] < high)] > line).mean())
-        for low, high in sizes
+        name: float((full[(truth[:, 0] >= low) & (truth[:, 0] < high)] > line).mean())
+        for name, low, high in sizes
         if ((truth[:, 0] >= low) & (truth[:, 0] < high)).any()
     }
     return {"area": area, "found_at_5_percent": found}

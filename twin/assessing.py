@@ -29,6 +29,7 @@ from twin.estimates import NAMES
 from twin.estimator import Estimator
 from twin.estimator_file import load_estimator, without_luminaires
 from twin.fields import flat, tables_of
+from twin.imagined import check_fields
 from twin.pooled import each
 from twin.report import write_json
 from twin.stage import usable
@@ -145,6 +146,7 @@ def levels_of(source: Corpus, estimator: Estimator) -> list[int]:
         allowed = f"levels {depths}, as the model was trained for"
         raise DesignError("indentation_mm", shown(there), allowed, source=source.name)
     _same_sensor(source, estimator)
+    check_fields(source.plan)
     return [there.index(depth) for depth in depths]
 
 

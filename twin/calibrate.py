@@ -29,7 +29,7 @@ from twin.estimator import Estimator, Sight
 from twin.estimator_file import emulator_of, file_of, load_estimator, save_estimator, shares_of
 from twin.fitting import inside, reachable
 from twin.frame import versions
-from twin.imagined import Brightness, check_field, mean_variance, pictures
+from twin.imagined import Brightness, mean_variance, pictures
 from twin.pooled import each
 from twin.rendered import rendered
 from twin.train import LIKE, level_names, likeness_of
@@ -76,9 +76,6 @@ def calibrate(
     if lean:
         shares_of(emulator_of(model), estimator.traced)
     levels = levels_of(source, estimator)
-    for field in source.plan.columns:
-        if "." in field:
-            check_field(field, source.name)
     numbers = [int(n) for n in source.samples if source.plan.inclusion(int(n)) is not None][:samples]
     if len(numbers) < LEAST:
         raise DesignError("samples", shown(len(numbers)), f"{LEAST} or more inclusions", source=source.name)

@@ -166,7 +166,7 @@ def _trust(corpus: Corpus) -> str:
         "noise_percent": "Monte Carlo noise of the light, standard deviation of a pixel, %",
         "error_percent": "error of the mechanics' signal, estimated, %",
         "saturated_percent": "pixels that are full, %",
-        "min_pressure_kPa": "lowest contact pressure, kPa (below 0: contact would open)",
+        "min_pressure_kPa": "lowest contact pressure, kPa (0: contact has opened somewhere)",
     }
     rows = ["| | median | worst |", "|---|---|---|"]
     for name, words in said.items():

@@ -86,8 +86,6 @@ def _bodies(axes: Axes, frame: Pictured, mesh: pv.PolyData) -> tuple[Floats, Flo
     count = len(frame.design.waveguide.layers)
     colours = np.array([TISSUE, INCLUSION, *(LAYERS[i % len(LAYERS)] for i in range(count))])
     material = np.asarray(mesh.cell_data["material"]).astype(int)
-    if frame.inclusion is None:  # the mesh may keep its sphere of cells; the tissue has none
-        material = np.where(material == 1, 0, material)
     moved = (np.asarray(mesh.points) + np.asarray(mesh.point_data["displacement"]))[:, [0, 2]]
     fill = list(colours[material])
     axes.add_collection(

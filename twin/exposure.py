@@ -137,7 +137,7 @@ def saturated_percent(design: Design, image: np.ndarray, radiance: np.ndarray) -
     well = camera.offset_dn + camera.full_well_e * camera.binning**2 / camera.gain_e_per_dn
     mean = mean_counts(camera, radiance, design.light.wavelength_nm)
     full = (image >= 2**camera.bits - 1) | (mean >= well * (1 - 1e-12))
-    return 100.0 * float(full.mean())
+    return 100.0 * float((full if full.ndim == 2 else full.any(axis=2)).mean())
 
 
 def _random(seed: int, *purpose: int) -> np.random.SeedSequence:

@@ -50,8 +50,7 @@ def specimens(plan: Plan, count: int, seed: int) -> list[dict[str, float]]:
         )
     tables = tables_of(plan.base)
     varied = tuple(expand(tables, study.randomise))
-    for one in varied:
-        check_field(one.field, plan.name)
+    check_fields(plan)
     if plan.emulator is None:
         raise DesignError("mechanics", shown(plan.mechanics), '"emulator"', source=plan.name)
     setting = Setting(seed, tables, plan.base, varied, fem.load_emulator(plan.emulator))
@@ -61,13 +60,14 @@ def specimens(plan: Plan, count: int, seed: int) -> list[dict[str, float]]:
     return [{name: float(columns[name][number]) for name in names} for number in range(count)]
 
 
-def check_field(field: str, source: str) -> None:
-    """Raise `DesignError` for a field that the chain does not know."""
-    parts = field.split(".")
-    known = field in FIELDS or (parts[0] == "leds" and parts[-1] == "flux_W")
-    if not known and parts[:2] != ["press", "indentation_mm"]:
-        allowed = f"{', '.join(FIELDS)}, leds.*.flux_W, press.indentation_mm"
-        raise DesignError(f"randomise.{field}", "it", allowed, source=source)
+def check_fields(plan: Plan) -> None:
+    """Raise `DesignError` where samples differ in what the chain does not know: drawn, or from a table."""
+    for field in plan.columns:
+        parts = field.split(".")
+        known = field in FIELDS or (parts[0] == "leds" and parts[-1] == "flux_W")
+        if "." in field and not known and parts[:2] != ["press", "indentation_mm"]:
+            allowed = f"{', '.join(FIELDS)}, leds.*.flux_W, press.indentation_mm"
+            raise DesignError("what varies", field, allowed, source=plan.name)
 
 
 def inputs_of(

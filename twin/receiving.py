@@ -22,7 +22,7 @@ from twin.complaint import DesignError, shown
 from twin.exposure import REFERENCE_FRAMES
 from twin.frame import MEAN, RECORD
 from twin.received import MAX_FRAMES, Received, Wanted
-from twin.sound import check_exposure, check_pair, check_same
+from twin.sound import check_apart, check_exposure, check_pair, check_same
 
 Float = NDArray[np.float32]
 
@@ -109,9 +109,11 @@ def _mean(files: list[Path], wanted: Wanted) -> Float:
     """The mean of exposures of one press level, each of them checked."""
     total = np.zeros(wanted.planes, np.float64)
     first: Float | None = None
+    taken: dict[bytes, str] = {}
     for place in files:
         picture = _png(place, wanted)
         check_exposure(picture, wanted.bits, str(place))
+        check_apart(picture, str(place), taken)
         if first is None:
             first = picture
         else:
@@ -194,6 +196,9 @@ def _from_folders(folders: list[Path], wanted: Wanted, exposures: int) -> Receiv
     ((frames, several),) = counts
     _check_frames(frames, wanted)
     for first, *others in read:
+        taken: dict[bytes, str] = {}
+        for one in (first, *others):
+            check_apart(one.image, one.name, taken)
         for other in others:
             check_same(first.image, other.image, wanted.bits, (first.name, other.name))
     images = [_weighted([(one.image, one.frames) for one in same]) for same in read]

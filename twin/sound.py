@@ -5,6 +5,8 @@ These checks know no model: what they refuse is wrong for every sensor.
 
 from __future__ import annotations
 
+import hashlib
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -46,6 +48,16 @@ def check_same(
     if rms > most:
         received = f"a picture {rms:.3g} counts (rms) from {names[0]}"
         raise DesignError(names[1], received, f"exposures of one press, at most {most:.3g} apart")
+
+
+def check_apart(picture: NDArray[np.floating], name: str, taken: dict[bytes, str]) -> None:
+    """Refuse a picture that was given before: copies of an exposure tell no more than one of them. ``taken``
+    holds what was given, and then this one, too."""
+    key = hashlib.sha256(np.ascontiguousarray(picture).tobytes()).digest()
+    if key in taken:
+        allowed = "exposures that were taken one by one (of twin simulate: each with a --seed of its own)"
+        raise DesignError(name, f"the same picture as {taken[key]}", allowed)
+    taken[key] = name
 
 
 def check_pair(received: Received) -> None:
