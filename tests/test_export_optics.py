@@ -173,7 +173,7 @@ def test_fraction_in_contact_is_the_lights() -> None:
     for contact in ("rough", "full"):
         sensor = dataclasses.replace(base, skin=dataclasses.replace(base.skin, contact=contact))
         top = meshes.bodies(sensor, surface.flat(25.0, 1.0))["contact"]
-        expected = real_contact(np.ones(1), sensor.skin, sensor.effective_modulus_kPa)
+        expected = float(real_contact(np.ones(1), sensor.skin, sensor.effective_modulus_kPa)[0])
         np.testing.assert_allclose(top.vertex_attributes["contact_fraction"], expected, rtol=1e-5)
     assert expected == 1.0
 

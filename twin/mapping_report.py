@@ -107,16 +107,16 @@ def _tell_part(tell: Callable[[str, float], None], part: int, parts: int, done: 
 
 def differences(corpora: Sequence[Corpus]) -> list[list[str]]:
     """Return the fields of the designs that are not the same: name, and the value in each corpus."""
-    flat = [flat(TypeAdapter(Design).dump_python(corpus.design, mode="json")) for corpus in corpora]
+    tables = [flat(TypeAdapter(Design).dump_python(corpus.design, mode="json")) for corpus in corpora]
     rest: list[dict[str, Any]] = [
         {"mechanics of the plan": c.plan.mechanics, "quality": c.plan.quality, "light": c.plan.light}
         for c in corpora
     ]
-    flat = [one | more for one, more in zip(flat, rest, strict=True)]
+    tables = [one | more for one, more in zip(tables, rest, strict=True)]
     names = [
-        name for name in {key: None for one in flat for key in one} if name not in ("name", "description")
+        name for name in {key: None for one in tables for key in one} if name not in ("name", "description")
     ]
-    rows = [[name, *(str(one.get(name, "—")) for one in flat)] for name in names]
+    rows = [[name, *(str(one.get(name, "—")) for one in tables)] for name in names]
     return [row for row in rows if len(set(row[1:])) > 1]
 
 
