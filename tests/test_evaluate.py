@@ -249,3 +249,15 @@ def test_solved_slopes_are_those_of_independent_solves() -> None:
         assert error < 0.03, name
         assert not found.slopes[name][1].any()
     assert found.slopes[DEPTH][1] == pytest.approx(found.plain, rel=1e-5, abs=1e-7)
+
+
+@pytest.mark.parametrize("efficiency", [0.5, 1.0])
+def test_a_camera_that_misses_nothing_has_a_slope_to_its_efficiency(efficiency: float) -> None:
+    """Counts go with it; at 1, which no step passes, the slope is taken to one side."""
+    base = small()
+    design = replace(base, camera=replace(base.camera, quantum_efficiency=efficiency, full_well_e=1e7))
+    radiance = np.full((1, len(design.leds), *design.camera.shape), 1e-3)
+    unknown = Unknown("camera.quantum_efficiency", 0.01, relative=True)
+    layers, rest = judging._camera_slope(design, radiance, unknown)
+    np.testing.assert_allclose(layers, pixels.counted(design, radiance).layers, rtol=1e-3)
+    np.testing.assert_allclose(rest, 0.0, atol=1e-6)

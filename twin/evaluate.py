@@ -21,7 +21,7 @@ from twin import objectives, touches
 from twin.bench import Bench, Work, optical_key
 from twin.complaint import DesignError, shown
 from twin.conflicts import black, colourless, straight
-from twin.design import Design
+from twin.design import Design, parse_design
 from twin.exposure import REFERENCE_FRAMES
 from twin.fields import number_at, put, tables_of
 from twin.forward import Unknown
@@ -279,16 +279,19 @@ def _camera_slope(design: Design, radiance: NDArray[Any], unknown: Unknown) -> t
             "unknowns", f"{unknown.name} = {shown(value)}", "a number that the design holds, > 0"
         )
     step = 1e-3 if unknown.relative else 1e-3 * max(abs(value), 1e-3)
-    ends = (value * np.exp(-step), value * np.exp(step)) if unknown.relative else (value - step, value + step)
-    found = []
-    for end in ends:
-        from twin.design import parse_design
-
-        found.append(pixels.counted(parse_design(put(tables, [(unknown.name, float(end))])), radiance))
-    low, high = found
+    ends, found = [], []
+    for way in (-step, step):
+        end = value * np.exp(way) if unknown.relative else value + way
+        try:
+            there = parse_design(put(tables, [(unknown.name, float(end))]))
+        except DesignError:  # the value is as far as a design may go: a slope to one side
+            way, there = 0.0, design
+        ends.append(way)
+        found.append(pixels.counted(there, radiance))
+    (low, high), apart = found, ends[1] - ends[0]
     planes = 2 if design.camera.colour == "mono" else 3
-    layers = (high.layers - low.layers) / (2.0 * step)
-    whole = (high.mean - low.mean) / (2.0 * step)
+    layers = (high.layers - low.layers) / apart
+    whole = (high.mean - low.mean) / apart
     both = low.open & high.open
     return layers, whole - np.where(both, layers.sum(axis=-planes - 1), 0.0)
 
