@@ -141,6 +141,7 @@ def test_picture_is_that_of_stock_path(variant: str, tissue: Tissue) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3600)
 def test_standard_is_the_reference(variant: str) -> None:
     from scenes import Renderer
 

@@ -245,6 +245,7 @@ def test_trapped_share_of_an_isotropic_source_under_another_layer(
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3600)
 @pytest.mark.parametrize(("coupling", "stack"), [("air", "denser above"), ("embedded", "three")])
 def test_energy_closes_and_standard_is_the_reference(variant: str, coupling: Any, stack: str) -> None:
     """Emitted = sum of sinks to 0.2 %; all light of both pictures within 1 % and three standard errors."""

@@ -288,7 +288,8 @@ def fit(
         slope = weighted.T @ rest - precision @ (x - prior.middle)
         free = np.arange(len(x)) >= held
         step, cut = step_inside(prior, x, information, slope, free)
-        inverse = np.asarray(np.linalg.inv(information))
+        inverse = np.linalg.inv(information)
+        inverse = 0.5 * (inverse + inverse.T)  # even but for rounding, which who draws from it would see
         found = Fitted(x, inverse, float(rest @ np.linalg.solve(noise, rest)), seen)
         size = np.abs(step) / np.sqrt(np.diag(inverse))
         steps = [share * step for share in _SHARES]

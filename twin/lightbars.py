@@ -90,7 +90,7 @@ def draw_first(axes: Axes, checkup: Checkup) -> None:
         "handlelength": 1.2,
         "columnspacing": 1.0,
     }
-    axes.legend(handles, words, loc="upper left", bbox_to_anchor=(-0.08, -0.17), **style)
+    axes.legend(handles, words, loc="upper left", bbox_to_anchor=(-0.08, -0.24), **style)
 
 
 def draw_legend(axes: Axes, checkup: Checkup) -> None:
@@ -114,7 +114,8 @@ def write_facts(axes: Axes, checkup: Checkup) -> None:
     shown = checkup.standard or checkup.blank or checkup.background
     top = 2**camera.bits - 1
     lines = [
-        f"Into the camera: {checkup.together(checkup.detected):.2g} % of the light.",
+        f"Into the camera: {checkup.together(checkup.detected):.2g} % of the light"
+        + (", without what it is blind to." if not checkup.response.all() else "."),
         f"Brightest pixel {shown.brightest_dn:.0f} of {top} counts, mean {shown.mean_dn:.0f}; untouched "
         f"{checkup.background.mean_dn:.1f}.",
         f"Full pixels at {camera.exposure_ms:g} ms: {shown.saturated_percent:.3g} %.",
