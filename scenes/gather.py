@@ -118,11 +118,11 @@ def glance(scene: mi.Scene, sensor: Sensor, table: Table, coupling: Coupling, ra
     start = origin + STEP_MM / direction.z * direction
     for _ in range(_SIGHTS):
         for rung in climb(scene, sensor, start, direction):
-            gain *= kept(rung.met.t)
+            gain = gain * kept(rung.met.t)  # not in place: the first one is the cache's
             _add_lamps(lamps, rung.met, gain * deeper[rung.layer - 1], sensor, named, patterns)
             gain = dr.select(rung.passes, gain, 0.0)
         si = meet(scene, named["contact"], start, direction)
-        gain *= kept(si.t)
+        gain = gain * kept(si.t)
         seen = si.is_valid() & (si.shape == named["contact"])
         _add_lamps(lamps, si, gain, sensor, named, patterns)
         windows.append(gain)
@@ -139,11 +139,11 @@ def glance(scene: mi.Scene, sensor: Sensor, table: Table, coupling: Coupling, ra
         gain = dr.select(seen, gain * (1.0 - transmitted), 0.0)
         down = mi.Vector3f(direction.x, direction.y, -direction.z)
         below = scene.ray_intersect(mi.Ray3f(si.p + STEP_MM * down, down), seen)
-        gain *= kept(below.t)
+        gain = gain * kept(below.t)
         _add_lamps(lamps, below, gain, sensor, named, patterns)
         through = below.is_valid() & (below.shape == named["layer_1" if guide.lower else "guide_to_glass"])
         for rung in descend(scene, sensor, si.p, down):
-            gain *= kept(rung.met.t)
+            gain = gain * kept(rung.met.t)
             alight = dr.select(through, gain * deeper[rung.layer - 1], 0.0)
             _add_lamps(lamps, rung.met, alight, sensor, named, patterns)
             through &= rung.passes

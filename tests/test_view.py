@@ -226,7 +226,9 @@ def test_reflections_inside_the_glass_are_summed_to_the_last(absorption: float) 
     assert float(found) == pytest.approx(outside, rel=1e-12)
 
 
-def looking_at_a_leaning_plane(sensor: Sensor, pressure_kPa: float) -> tuple[Any, view.PixelRays]:
+def looking_at_a_leaning_plane(
+    sensor: Sensor, pressure_kPa: float, rays: view.PixelRays | None = None
+) -> tuple[Any, view.PixelRays]:
     """What the camera sees of a contact surface at z = -0.2 + 0.01 x, and its rays."""
     from scenes import build, gather
     from scenes.bsdf import Table
@@ -241,7 +243,7 @@ def looking_at_a_leaning_plane(sensor: Sensor, pressure_kPa: float) -> tuple[Any
     x, _ = np.meshgrid(line, line)
     plane = np.stack([0 * x, 0 * x, -0.2 + 0.01 * x], axis=-1)
     build.put_surface(scene, sensor, OpticalSurface(line, plane, pressure_kPa + 0 * x, 0 * x))
-    rays = view.pixel_rays(sensor)
+    rays = rays or view.pixel_rays(sensor)
     return gather.look(scene, sensor, Table(packed), coupling, rays), rays
 
 
@@ -277,6 +279,15 @@ def test_light_is_absorbed_on_its_way_to_the_camera(mi: ModuleType, lower: tuple
     absorbed = windows(0.0, 0.1)[0] / clear
     np.testing.assert_allclose(absorbed[0], np.exp(-0.1 * in_glass), rtol=5e-4)
     assert np.all(absorbed[1] < 0.7 * absorbed[0])
+
+
+def test_an_absorbing_guide_looks_the_same_again(mi: ModuleType) -> None:
+    """What rays lose is worked out anew each time, and not taken from what they had before."""
+    base = paper_sensor(columns=48, rows=32, field_of_view_mm=20.0)
+    sensor = dataclasses.replace(base, guide=dataclasses.replace(base.guide, absorption_per_mm=0.05))
+    rays = view.pixel_rays(sensor)
+    first, again = (looking_at_a_leaning_plane(sensor, 0.0, rays)[0].windows for _ in range(2))
+    np.testing.assert_array_equal(first, again)
 
 
 def test_camera_looks_at_the_deformed_surface(mi: ModuleType) -> None:
