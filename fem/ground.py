@@ -10,6 +10,7 @@ strain on a fine mesh times that polynomial; likewise the displacement, plus wha
 from __future__ import annotations
 
 from functools import lru_cache
+from itertools import groupby
 
 import numpy as np
 import pyvista as pv
@@ -30,11 +31,8 @@ from fem.topology import Resolution
 Floats = NDArray[np.float64]
 
 _GROWTH = (0.7, 1.6)  # of the fine mesh's cells towards the probe's edge, and beyond it
-_LEAN_GROWTH = (0.6, 1.6)
-_DEEP, _DEEP_GROWTH = (
-    0.12,
-    (2.0, 1.6),
-)  # strain from which that is: such cells give way later, and ripple more
+_LEAN = (0.6, 2.0)  # the lean mesh's, up to the first strain and from the second one: cells that shrink less
+_STRAIN = (0.12, 0.2)  # give way later, and ripple more towards the edge
 _DEGREE = 4  # of the share of finite strain, along x and y
 _WITHIN = (
     0.91  # of the probe's half width, where it is learned: beyond, cells of the lean mesh tell of themselves
@@ -67,8 +65,12 @@ def fine(res: Resolution) -> Resolution:
     )
 
 
-def lean(res: Resolution, growth: tuple[float, float]) -> Resolution:
-    """Mesh of what finite strain changes."""
+def lean(res: Resolution, strain: float = 0.0) -> Resolution:
+    """Mesh of what finite strain changes, at an indentation over the slab's thickness.
+
+    It changes with that little by little, so that pressure does not jump.
+    """
+    growth = (float(np.interp(strain, _STRAIN, _LEAN)), _GROWTH[1])
     return Resolution(
         min(res.arc, 2), 1, 1, min(res.above, 2), 1, min(res.arc + 1, 3), min(res.side, 2), 1, 1, growth
     )
@@ -103,15 +105,14 @@ def ground(
     small = _pressed(geometry, fine(res), False, levels)
     if not finite:
         return small
-    deep = levels[-1] > _DEEP * geometry.slab.thickness_mm
-    coarse = lean(res, _DEEP_GROWTH if deep else _LEAN_GROWTH)
-    changed = zip(
-        small,
-        _pressed(geometry, coarse, False, levels),
-        _pressed(geometry, coarse, True, levels),
-        strict=True,
-    )
-    return tuple(_strained(*each) for each in changed)
+    # every level on the mesh of its own depth: what is pressed beside it does not show
+    meshes = [lean(res, level / geometry.slab.thickness_mm) for level in levels]
+    found: list[pv.PolyData] = []
+    for coarse, group in groupby(zip(meshes, levels, strict=True), key=lambda each: each[0]):
+        own = tuple(level for _, level in group)
+        both = (_pressed(geometry, coarse, kind, own) for kind in (False, True))
+        found += map(_strained, small[len(found) :], *both)
+    return tuple(found)
 
 
 def _pressed(

@@ -61,3 +61,12 @@ def test_finite_strain_on_the_same_cells_all_the_way() -> None:
     off = 100 * (pressure(found) / pressure(direct) - 1)
     print(f"within 10 mm: {np.sqrt((off**2).mean()):.2f} % rms, {np.abs(off).max():.2f} at worst")
     assert np.sqrt((off**2).mean()) < 0.3
+
+
+def test_deeper_presses_do_not_jump() -> None:
+    """On either side of the depth from which cells shrink less, and whatever else is pressed beside it."""
+    (lesser,), (one, more) = (ground(BARE, PREVIEW, True, levels) for levels in ((3.59,), (1.0, 3.61)))
+    off = 100 * (pressure(more) / pressure(lesser) * 3.59 / 3.61 - 1)
+    print(f"{off.min():.2f} to {off.max():.2f} %")
+    assert np.abs(off).max() < 0.3
+    assert np.array_equal(pressure(one), pressure(ground(BARE, PREVIEW, True, (1.0,))[0]))
