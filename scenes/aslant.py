@@ -33,6 +33,7 @@ _FINE_PER_MM = 1.5  # wave number of what is seen about half: light on a contact
 _AZIMUTHS, _WAVES = 24, 60
 _TOP = 25.0  # of k, 1/mean free path: beyond, all fall as 1/k
 _GRAZING = 0.1  # cosine below which little gets through any contact
+_THIN, _FINEST_PER_MM = 10.0, 25.0  # of a slab: k by which exp(-k depth) is gone, and what no map shows
 _DARK = 1e-4  # answer whose parts do not matter
 _BLACK = 1e-12  # share that comes back, below which nothing does
 ALL, STEEP, DEEP, HELD = 0, 1, 2, 3
@@ -59,12 +60,15 @@ class Aslant:
     transport_per_mm: float
     functions: tuple[Array, ...]
     transforms: tuple[Array, ...]
+    top: float = _TOP
 
     def at(self, transforms: Array, wave_per_mm: Array, tail: float) -> Array:
         """Transforms (..., K) at wave numbers, 1/mm: (..., *shape); beyond the last as k^-tail."""
         scaled = np.asarray(wave_per_mm) / self.transport_per_mm
-        found = CubicSpline(_stretched(_waves()), transforms, axis=-1)(_stretched(np.minimum(scaled, _TOP)))
-        return np.asarray(found * (_TOP / np.maximum(scaled, _TOP)) ** tail)
+        found = CubicSpline(_stretched(_waves(self.top)), transforms, axis=-1)(
+            _stretched(np.minimum(scaled, self.top))
+        )
+        return np.asarray(found * (self.top / np.maximum(scaled, self.top)) ** tail)
 
 
 def aslant(
@@ -72,12 +76,13 @@ def aslant(
 ) -> Aslant:
     """Take the answer of a body apart: `lobes` (modes, n) are its φ_i on cosines uniform on 0..1, the indices
     its own and that of what fills the gaps above it."""
-    beams, diffuse = _beams(body, refractive_index, gap_index)
+    top = max(_TOP, min(_THIN / body.depth, _FINEST_PER_MM / transport_per_mm))
+    beams, diffuse = _beams(body, refractive_index, gap_index, top)
     cosine, _ = cosines()
     by_harmonic = np.fft.fft(beams, axis=3) / _AZIMUTHS
     peak = np.maximum(np.abs(beams).max(axis=(1, 2, 3)), _DARK)[:, None, None]
     seen = cosine / (cosine + _GRAZING)
-    fine = 1.0 / (1.0 + (_waves() * transport_per_mm / _FINE_PER_MM) ** 1.5)[:, None]
+    fine = 1.0 / (1.0 + (_waves(top) * transport_per_mm / _FINE_PER_MM) ** 1.5)[:, None]
     grid = np.linspace(0.0, 1.0, lobes.shape[1])
     there = np.stack([np.interp(cosine, grid, lobe) for lobe in lobes])
     functions, transforms = [], []
@@ -101,14 +106,16 @@ def aslant(
         sine = [np.sqrt(1.0 - values**2) if m % 2 else np.ones(values.size) for values in (cosine, grid)]
         further = CubicSpline(cosine, shapes[:count] / seen / sine[0], axis=1)(grid) * sine[1]
         functions.append(np.vstack([lobes, further]) if m == 0 else further)
-    return Aslant(transport_per_mm, tuple(functions), tuple(transforms))
+    return Aslant(transport_per_mm, tuple(functions), tuple(transforms), top)
 
 
 @lru_cache(maxsize=16)
-def _beams(slab: Slab, refractive_index: float, gap_index: float) -> tuple[NDArray[np.complex128], Array]:
+def _beams(
+    slab: Slab, refractive_index: float, gap_index: float, top: float
+) -> tuple[NDArray[np.complex128], Array]:
     """`Slab.aslant` and `HELD` at the Gauss cosines, and the transform of Lambertian light; 1 to 2 s."""
     azimuth = 2.0 * np.pi * np.arange(_AZIMUTHS) / _AZIMUTHS
-    beams, diffuse = slab.aslant(_waves(), cosines()[0], azimuth), slab.reflectance(_waves())
+    beams, diffuse = slab.aslant(_waves(top), cosines()[0], azimuth), slab.reflectance(_waves(top))
     held = beams[ALL]
     if np.isinf(slab.depth) and diffuse[0] > _BLACK and gap_index < refractive_index:
         gap = gap_index, gap_index, 0.0  # endless: any wavelength will do
@@ -141,9 +148,10 @@ def by_exit(steep: NDArray[np.complex128], counts: Array) -> NDArray[np.complex1
     return found
 
 
-def _waves() -> Array:
+def _waves(top: float = _TOP) -> Array:
     """Wave numbers of the transforms, 1/mean free path."""
-    return np.concatenate([[0.0], np.geomspace(0.02, _TOP, _WAVES)])
+    count = round(_WAVES * np.log(top / 0.02) / np.log(_TOP / 0.02))
+    return np.concatenate([[0.0], np.geomspace(0.02, top, count)])
 
 
 def _stretched(k: Array) -> Array:

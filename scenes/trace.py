@@ -169,7 +169,7 @@ def walk(
         sink["housing"] += dr.select(on_housing, stopped, 0.0)
         sink["frame"] += dr.select(on_led | on_wall | on_housing, 0.0, stopped)
         passed = elsewhere & (cosine * dr.dot(direction, met.normal) < 0.0)
-        leg = next_leg(leg, met.kind, passed)
+        leg = next_leg(leg, met.kind, passed, by_own_window(sensor, number, met))
 
         survive = chance(kept, bounce)
         alive = alive & (kept > 0.0) & (random.next_float32() < survive) & (bounce < MAX_BOUNCES)
@@ -384,11 +384,25 @@ def is_gathered(leg: mi.UInt32) -> mi.Bool:
     return (leg == IN_GUIDE) | (leg == _BACK_UP)
 
 
-def next_leg(leg: mi.UInt32, kind: mi.UInt32, passed: mi.Bool) -> mi.UInt32:
-    """The leg after an event at a face of this kind, `passed` if light went through it."""
+def by_own_window(sensor: Sensor, number: mi.UInt32, met: Meeting) -> mi.Bool:
+    """Where light of these LEDs may enter that `direct` gathers: in painted walls, by its own window."""
+    if sensor.guide.walls == "polished":
+        return mi.Bool(True)
+    half, found = sensor.guide.width_mm / 2, mi.Bool(False)
+    for k, led in enumerate(sensor.leds):
+        if led.coupling == "air" and led.side != "below":
+            centre, axis, _ = led_frame(led, half)
+            middle = mi.Point3f(*(centre + led.gap_mm * axis).tolist())
+            found = found | ((number == k) & (dr.squared_norm(met.p - middle) <= led.window_mm**2))
+    return found
+
+
+def next_leg(leg: mi.UInt32, kind: mi.UInt32, passed: mi.Bool, own: mi.Bool | bool = True) -> mi.UInt32:
+    """The leg after an event at a face of this kind, `passed` if light went through it, at its `own` window
+    (`by_own_window`)."""
     following = mi.UInt32(OTHER)
     for before, event, after in (
-        (IN_AIR, (kind == WALL) & passed, IN_GUIDE),
+        (IN_AIR, (kind == WALL) & passed & own, IN_GUIDE),
         (IN_GUIDE, (kind == TO_GLASS) & passed, _DOWN),
         (IN_GUIDE, (kind == LAYER) & passed, IN_GUIDE),
         (_DOWN, (kind == TO_AIR) & ~passed, _IN_GLASS_UP),

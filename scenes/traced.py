@@ -35,11 +35,12 @@ _COARSE = 50  # cells per side on which modes are kept
 _FINE = 100  # on which their mean is
 _BEYOND = 2.0  # how far inputs may leave what was learned, times its reach
 FORMAT = "tsis-traced-3"
-LIGHT = 8
-"""Counts up when pictures of the same press change: what was learned or kept before is of no use then."""
+LIGHT = 9
+"""Counts up when pictures of the same press change: what was learned or kept before is of no use then.
+9: windows of other LEDs in painted walls, thin sheets that hardly scatter (see `version`)."""
 BIAS_SINCE = 5
 """The first light of which a quality's measured bias holds: what changed since is common to all qualities, or
-less than the bias is known to (LIGHT 7, 8: 0.11 % in a blob, 0.09 % in a background)."""
+less than the bias is known to (LIGHT 7 to 9: 0.11 % in a blob, 0.09 % in a background)."""
 ARRAYS = ("centre", "axes", "nodes", "weights", "mean", "modes")
 """Fields of `TracedLight` that are arrays."""
 
@@ -88,7 +89,7 @@ class TracedLight:
         NotModelled
             For another sensor, and for presses far from those that were learned.
         """
-        if optics_key(sensor) != self.key:
+        if optics_key(sensor) != self.key or _in_the_dark(self, sensor):
             raise NotModelled(
                 "traced: received light learned of another sensor or by an earlier version; allowed this "
                 "sensor's own"
@@ -107,13 +108,19 @@ class TracedLight:
         return found
 
 
+def version(sensor: Sensor) -> int:
+    """Return the last `LIGHT` that changed a sensor's pictures; 9 changed none of polished walls without a
+    sheet, as the light that ships is of."""
+    return 8 if sensor.guide.walls == "polished" and sensor.skin.sheet is None else LIGHT
+
+
 def optics_key(sensor: Sensor) -> str:
     """Return a hash of all that traced light depends on, but for the press: not the camera, the LEDs' power
     and what the contact fraction says."""
     leds = tuple(replace(led, flux_W=1.0, ies=None) for led in sensor.leds)
     skin = replace(sensor.skin, rms_slope=1.0, kappa=1.0)
     told: tuple[object, ...] = (
-        LIGHT,
+        version(sensor),
         sensor.guide,
         sensor.glass,
         leds,
@@ -128,11 +135,18 @@ def optics_key(sensor: Sensor) -> str:
 
 def check(light: Sequence[TracedLight], sensors: Sequence[Sensor]) -> None:
     """Raise `NotModelled` if light was not learned of these sensors, one for each band."""
-    if [one.key for one in light] != [optics_key(sensor) for sensor in sensors]:
+    keys = [optics_key(sensor) for sensor in sensors]
+    if [one.key for one in light] != keys or any(map(_in_the_dark, light, sensors)):
         raise NotModelled(
             "traced: received light learned of another sensor or by an earlier version; allowed this one's "
             "(LED power, camera and rms_slope are free)"
         )
+
+
+def _in_the_dark(light: TracedLight, sensor: Sensor) -> bool:
+    """Whether an LED is lit that was dark in this band where its light was learned."""
+    lit = np.array([led.flux_W > 0.0 for led in sensor.leds])
+    return bool((lit & ~light.mean.any(axis=(1, 2, 3))).any())
 
 
 def describe(shape: OpticalSurface, fraction: Array) -> Array:

@@ -19,7 +19,7 @@ from twin.assessment import answered, record_of, words
 from twin.complaint import DesignError
 from twin.design import load_design, parse_design
 from twin.estimator import Estimator
-from twin.fields import tables_of
+from twin.fields import put, tables_of
 from twin.report import write_json
 
 RANGES = np.array([[2.0, 13.0], [4.0, 12.0], [40.0, 120.0], [-2.0, 2.0], [-2.0, 2.0]])
@@ -159,8 +159,12 @@ def test_an_answer_that_is_kept_is_not_made_again(tmp_path: Path, monkeypatch: p
         network=network,
         unscaled=lambda drawn: drawn,
         presence=lambda seen, frames, middle: 0.01 * frames,
+        prior=SimpleNamespace(names=()),
     )
-    plan = SimpleNamespace(parameters=lambda number: {}, inclusion=lambda number: None)
+    base = load_design("tsis")
+    plan = SimpleNamespace(
+        parameters=lambda number: {}, inclusion=lambda number: None, base=base, indentation_mm=(1.0,)
+    )
     for name, value in (
         ("loaded", lambda model: estimator),
         ("opened", lambda corpus: SimpleNamespace(plan=plan)),
@@ -178,6 +182,36 @@ def test_an_answer_that_is_kept_is_not_made_again(tmp_path: Path, monkeypatch: p
     assessing.answer(both)
     row = json.loads(one.place.read_bytes())
     assert row["1"] == {"presence": 0.01} and row["100"] == {"presence": 1.0} and assessing._done(both)
+
+
+def test_answers_of_the_network_do_not_pass_for_rendered_ones(tmp_path: Path) -> None:
+    """Quick means beside a rendered answer are made anew where rendered ones are asked for; it stays."""
+    place = tmp_path / "000007.json"
+    place.write_text(json.dumps({"rendered": True, "quick": ["100"], "1": {"a": 1}, "100": {"a": 2}}))
+    task = assessing.Task("model", "corpus", 7, place, True, 0, (1, 100))
+    assert assessing._begun(task) == {"rendered": True, "1": {"a": 1}} and not assessing._done(task)
+    assert assessing._done(dataclasses.replace(task, rendered=False))
+
+
+def test_what_a_corpus_does_not_vary_is_as_its_design_says() -> None:
+    """Not as the model's: tissue of 6 kPa is no discrepancy of one of 5."""
+    base = parse_design(put(tables_of(load_design("tsis")), [("specimen.modulus_kPa", 6.0)]))
+    plan = SimpleNamespace(
+        base=base,
+        indentation_mm=(1.0, 2.0, 2.9),
+        parameters=lambda number: {"size_mm": 9.0, "depth_mm": None, "leds.0.flux_W": 0.02},
+    )
+    names = ("leds.0.flux_W", "leds.1.flux_W", "specimen.modulus_kPa", "press.indentation_mm.1")
+    estimator: Any = SimpleNamespace(prior=SimpleNamespace(names=names))
+    found = assessing.values_of(SimpleNamespace(plan=plan), estimator, 0, [0, 2])  # type: ignore[arg-type]
+    assert found == {
+        "size_mm": 9.0,
+        "leds.0.flux_W": 0.02,
+        "leds.1.flux_W": 0.01,
+        "specimen.modulus_kPa": 6.0,
+        "press.indentation_mm.0": 1.0,
+        "press.indentation_mm.1": 2.9,
+    }
 
 
 @pytest.mark.parametrize(("chi_square", "wider"), [(40.0, 1.0), (96.0, 1.0), (960.0, 10.0)])
@@ -218,6 +252,8 @@ def test_words_are_of_the_sizes_that_were_held_out() -> None:
         ({"leds": {"z_mm": -4.0}}, "leds.0.z_mm: received -4.0"),
         ({"specimen": {"modulus_kPa": 6.0}}, None),
         ({"signal": {"counts": 4.0}}, None),
+        ({"press": {"indentation_mm": [3.0]}}, None),
+        ({"press": {"tilt_deg": [2.0, 0.0]}}, "press.tilt_deg.0: received 2.0"),
     ],
 )
 def test_a_corpus_of_another_sensor_is_refused_by_its_first_difference(

@@ -19,7 +19,7 @@ from twin import evaluate as judging
 from twin import touches
 from twin.complaint import DesignError
 from twin.evaluate import Bench, Layout, Protocol, evaluate
-from twin.forward import DEPTH, Unknown
+from twin.forward import DEPTH, Unknown, step_of
 from twin.layers import Lighting
 
 BALL = fem.Inclusion(9.0, 5.0, 80.0, (1.0, -0.5))
@@ -214,6 +214,35 @@ def test_steps_beyond_what_a_design_allows_are_taken_on_the_other_side(
     assert found.slopes["specimen.thickness_mm"][1, 3] == pytest.approx(-plain / 30.0, rel=1e-4)
     assert found.slopes[DEPTH][1, 3] == pytest.approx(plain, rel=1e-4)
     assert np.abs(found.slopes["size_mm"]).max() < 1e-6
+
+
+def test_steps_keep_an_inclusion_an_inclusion() -> None:
+    """Also one that is softer than the step that others are told with."""
+    for name, value in (("modulus_kPa", 1.5), ("depth_mm", 0.05), ("size_mm", 0.05)):
+        assert 0.0 < step_of(Unknown(name, 20.0), value) < 0.5 * value
+    assert step_of(Unknown("modulus_kPa", 23.0), 80.0) == 2.0
+    assert step_of(Unknown("offset_x_mm", 1.0), 0.0) == pytest.approx(0.1)
+
+
+def test_lumps_that_an_emulator_does_not_know_are_solved(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An emulator of a narrower sensor ends above the deepest of them."""
+
+    class Solved(Exception):
+        pass
+
+    def emulated(there: twin.Design, ball: fem.Inclusion, levels: Any, emulator: Any) -> list[Pressed]:
+        if ball.depth > 8.0:
+            raise fem.NotModelled("inclusion.depth: received 11 mm; allowed in this emulator 3.5 to 10 mm")
+        return [Pressed(there, ball, level) for level in levels]
+
+    def press(probe: fem.Probe, slab: fem.Slab, ball: fem.Inclusion, *rest: Any, **more: Any) -> Any:
+        assert ball.depth == 11.0
+        raise Solved
+
+    monkeypatch.setattr(touches.presses, "emulated", emulated)
+    monkeypatch.setattr(touches.fem, "press_moduli", press)
+    with pytest.raises(Solved):
+        evaluate(layout(), [BALL], FEW, emulator=Emulator(), bench=Bench(samples=2**12), detection=True)  # type: ignore[arg-type]
 
 
 @pytest.mark.slow

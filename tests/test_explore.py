@@ -275,6 +275,10 @@ def test_more_trials_go_on(tmp_path: Path) -> None:
     assert explore.work(more, evaluate=evaluated) == 3
 
 
+def test_a_grid_has_no_more_layouts_than_it_has(tmp_path: Path) -> None:
+    assert prepared(tmp_path, "grid", trials=10_000).trials == 27
+
+
 @pytest.mark.slow
 def test_the_command_explores(tmp_path: Path) -> None:
     """With real light and solves: two cameras, one inclusion, two processes; the plan measures."""

@@ -5,10 +5,11 @@ import os
 import shutil
 import stat
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from test_explore import STUDY, prepared
+from test_explore import STUDY, evaluated, prepared
 from test_lamp import file_of
 
 import twin
@@ -160,7 +161,8 @@ def test_a_storage_that_does_not_open_leaves_nothing(
 
 
 def test_a_password_is_kept_for_its_owner_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(explore, "opened", lambda made: None)
+    empty = SimpleNamespace(get_trials=lambda deepcopy: [])
+    monkeypatch.setattr(explore, "opened", lambda made: empty)
     monkeypatch.setattr(explore, "_enqueue", lambda made, study: None)
     for url, mode in (("postgresql://u:p@h/db", 0o600), ("postgresql://u@h/db", 0o666 & ~umask())):
         found = prepared(tmp_path, storage=url)
@@ -212,3 +214,37 @@ def test_workers_run_nothing_of_the_current_folder(tmp_path: Path, monkeypatch: 
     assert explore_crew._start(Path("out"), 0).wait(60) == 1
     assert not (tmp_path / "ran").exists()
     assert "FileNotFoundError" in (tmp_path / "out" / "workers" / "0.log").read_text()
+
+
+def test_a_folder_with_luminaires_may_be_moved(tmp_path: Path) -> None:
+    angles, here = np.array([0.0, 45.0, 90.0]), tmp_path / "a"
+    here.mkdir()
+    (here / "lamp.ies").write_text(file_of(angles, np.zeros(1), np.array([100.0, 70.0, 0.0])))
+    text = design_toml(twin.load_design("tsis")).replace('"lambertian"', '"ies"\nies = "lamp.ies"')
+    (here / "own.toml").write_text(text)
+    study = STUDY.replace("METHOD", "latin").replace("[fields]", 'design = "own.toml"\n[fields]', 1)
+    explore.prepare(written(here, study), here / "out")
+    there = here.rename(tmp_path / "b")
+    explore.prepare(there / "mine.toml", there / "out")
+    (there / "lamp.ies").write_text(file_of(angles, np.zeros(1), np.array([100.0, 5.0, 0.0])))
+    with pytest.raises(DesignError, match=r"another sensor \(leds\.0\.ies"):
+        explore.prepare(there / "mine.toml", there / "out")
+
+
+def test_a_storage_that_knows_nothing_of_the_folder_does_not_overwrite_it(tmp_path: Path) -> None:
+    explore.work(prepared(tmp_path, trials=3), evaluate=evaluated)
+    before = all_of(tmp_path / "out")
+    other = f"sqlite:///{tmp_path / 'other.db'}"
+    with pytest.raises(DesignError, match=r"--storage: .*which knows the layouts of that folder"):
+        prepared(tmp_path, trials=3, storage=other)
+    assert all_of(tmp_path / "out") == before
+    prepared(tmp_path, name="new", trials=3, storage=other)
+
+
+def test_an_emulator_that_nobody_asked_for_must_know_every_place(tmp_path: Path) -> None:
+    """The ball lies 8 mm beside the middle there; it knows 6."""
+    study = STUDY.replace("METHOD", "latin")
+    for number, (at, taken) in enumerate((("[[5.0, 0.0], [0.0, 0.0]]", True), ("[[8.0, 0.0]]", False))):
+        file = tmp_path / f"{number}.toml"
+        file.write_text(study.replace("[fields]", f"[protocol]\npositions_mm = {at}\n[fields]", 1))
+        assert (explore.prepare(file, tmp_path / str(number)).emulator is not None) == taken

@@ -237,6 +237,7 @@ def test_what_e_is_worth_is_said_plainly() -> None:
         (["--corpus", "{out}", "--out", "{out}"], ["corpus"]),
         (["--out", "{out}", "--workers", "0"], ["--workers", "> 0"]),
         (["--corpus", "{corpus}", "--out", "{taken}"], ["--out", "something else"]),
+        (["--corpus", "{corpus}", "--out", "{own}"], ["--out", "something else"]),
         (["--out", "{out}", "--emulator", "{out}/none.npz"], ["none.npz"]),
     ],
 )
@@ -245,7 +246,9 @@ def test_bad_input_is_one_line(
 ) -> None:
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "letter.txt").write_text("mine")
-    places = {"corpus": corpus, "out": tmp_path / "out", "taken": tmp_path / "taken"}
+    (tmp_path / "own").mkdir()
+    (tmp_path / "own" / "report.html").write_text("my own")
+    places = {"corpus": corpus} | {name: tmp_path / name for name in ("out", "taken", "own")}
     assert cli.main(["replicate", *(word.format(**places) for word in arguments)]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and all(word in error for word in words), error
@@ -259,6 +262,7 @@ def test_bad_input_is_one_line(
         ("another", "tsis", False, "--emulator: received a corpus planned with another emulator"),
         (None, "tsis", False, "--emulator: received a corpus planned without it"),
         ("tsis", "tsis", False, None),
+        ("tsis", "tsis", True, None),
         (None, None, True, None),
     ],
 )

@@ -13,6 +13,7 @@ import fem
 import twin
 from scenes import SpectralRenderer, traced
 from scenes.sensor import NotModelled, Sensor
+from scenes.skin import Sheet
 from scenes.surface import OpticalSurface
 from twin import learn_light
 from twin.complaint import DesignError
@@ -78,10 +79,24 @@ def test_an_led_that_is_dark_in_this_band_is_learned_as_dark(sensor):
     dark = replace(sensor, leds=(replace(sensor.leds[0], flux_W=0.0), *sensor.leds[1:]))
     surfaces, fractions, light = presses(60, 0)
     lit = [np.concatenate([0.0 * maps[:1], maps[1:]]) for maps in light]
-    found = traced.learn(
-        dark, [traced.describe(*one) for one in zip(surfaces, fractions, strict=True)], lit
-    ).at(dark, surfaces[0], fractions[0])
+    told = [traced.describe(*one) for one in zip(surfaces, fractions, strict=True)]
+    learned = traced.learn(dark, told, lit)
+    found = learned.at(dark, surfaces[0], fractions[0])
     assert np.isfinite(found).all() and not found[0].any() and found[1:].min() > 0.0
+    traced.check([learned], [dark])
+    for use in (
+        lambda: traced.check([learned], [sensor]),
+        lambda: learned.at(sensor, surfaces[0], fractions[0]),
+    ):
+        with pytest.raises(NotModelled, match="learned of another sensor"):  # its light was never followed
+            use()
+
+
+def test_a_light_that_changes_some_sensors_leaves_that_of_others(sensor):
+    """Painted walls and sheets have changed since what ships was learned, and nothing else."""
+    painted = replace(sensor, guide=replace(sensor.guide, walls="absorbing"))
+    covered = replace(sensor, skin=replace(sensor.skin, sheet=Sheet(0.1, 500.0)))
+    assert traced.version(sensor) < traced.version(painted) == traced.version(covered) == traced.LIGHT
 
 
 def test_a_failed_led_is_refused_before_anything_is_traced(tmp_path):
@@ -173,7 +188,7 @@ def test_files_of_an_earlier_light_are_refused_in_one_line(sensor, tmp_path, mon
     told = [traced.describe(*one) for one in zip(surfaces, fractions, strict=True)]
     place = tmp_path / "light.npz"
     with monkeypatch.context() as earlier:
-        earlier.setattr(traced, "LIGHT", traced.LIGHT - 1)
+        earlier.setattr(traced, "version", lambda sensor: 7)
         traced.save([traced.learn(sensor, told, light)], place)
         traced.check(light_of(place), [sensor])  # it was good in its time
     (old,) = light_of(place)

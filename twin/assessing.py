@@ -28,7 +28,7 @@ from twin.corpus import Corpus
 from twin.estimates import NAMES
 from twin.estimator import Estimator
 from twin.estimator_file import load_estimator, without_luminaires
-from twin.fields import flat, tables_of
+from twin.fields import PRESS, flat, number_at, tables_of
 from twin.imagined import check_fields
 from twin.pooled import each
 from twin.report import write_json
@@ -39,7 +39,7 @@ SAMPLES, RECORD, PICTURE = "samples", assessing_report.ASSESSMENT, assessing_rep
 KEPT = "curve.parts"
 """What a folder with a learning curve holds."""
 _DRAWS = 4000
-_OPEN = ("name", "description", "mechanics", "press.", "signal.")
+_OPEN = ("name", "description", "mechanics", "press.indentation_mm", "signal.")
 """Of a design, what may differ from the model's."""
 
 
@@ -150,6 +150,16 @@ def levels_of(source: Corpus, estimator: Estimator) -> list[int]:
     return [there.index(depth) for depth in depths]
 
 
+def values_of(source: Corpus, estimator: Estimator, number: int, levels: list[int]) -> dict[str, float]:
+    """Values of a sample by name, as the corpus's design has them where only the model varies them."""
+    plan = source.plan
+    tables = tables_of(plan.base)
+    found = {n: number_at(tables, n, n) for n in estimator.prior.names if not n.startswith(PRESS)}
+    found |= {f"{PRESS}.{level}": depth for level, depth in enumerate(plan.indentation_mm)}
+    found |= plan.parameters(number)
+    return level_names({name: value for name, value in found.items() if value is not None}, levels)
+
+
 def _same_sensor(source: Corpus, estimator: Estimator) -> None:
     """Refuse a sensor that differs from the model's in more than the model knows to vary."""
     own, other = (
@@ -197,7 +207,11 @@ def _done(task: Task) -> bool:
 def _begun(task: Task) -> dict[str, Any]:
     """What an earlier run has kept of a sample; nothing where it was answered with less than is asked for."""
     row: dict[str, Any] = json.loads(task.place.read_bytes()) if task.place.is_file() else {}
-    return row if row.get("rendered") or not task.rendered else {}
+    if task.rendered and not row.get("rendered"):
+        return {}
+    for frames in row.pop("quick", ()) if task.rendered else ():  # beside answers by rendering, but not by it
+        row.pop(frames, None)
+    return row
 
 
 @lru_cache(maxsize=1)
@@ -217,7 +231,7 @@ def answer(task: Task) -> None:
     estimator, source = loaded(task.model), opened(task.corpus)
     plan = source.plan
     levels = levels_of(source, estimator)
-    values = level_names({k: v for k, v in plan.parameters(task.number).items() if v is not None}, levels)
+    values = values_of(source, estimator, task.number, levels)
     blank = plan.inclusion(task.number) is None
     row = _begun(task) or {
         "sample": task.number,
@@ -239,6 +253,8 @@ def answer(task: Task) -> None:
         drawn = estimator.unscaled(estimator.network.sample(told, frames, _DRAWS, task.seed)[0])
         found: dict[str, Any] = {"presence": estimator.presence(seen, frames, drawn.mean(axis=0))}
         row[str(frames)] = found
+        if row["rendered"] and not task.rendered:
+            row.setdefault("quick", []).append(str(frames))
         if blank:
             continue
         truth = np.array([row["truth"]])

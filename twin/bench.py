@@ -177,10 +177,16 @@ class Work:
     def lump(self, ball: fem.Inclusion, level: float) -> NDArray[Any]:
         """Contact fields of an inclusion without any slopes."""
         work = replace(self, unknowns=())
-        own = work._touch(ball, level, (0.0, 0.0))
-        if self.emulator is not None:
-            return own.fields
-        return self._touch(self.ground, level, (0.0, 0.0)).plain + (own.fields - own.plain)
+        try:
+            own = work._touch(ball, level, (0.0, 0.0))
+        except fem.NotModelled:  # beyond what an emulator of another width or tissue knows
+            if self.emulator is None:
+                raise
+            own = replace(work, emulator=None)._touch(ball, level, (0.0, 0.0))
+        else:
+            if self.emulator is not None:
+                return own.fields
+        return work._touch(self.ground, level, (0.0, 0.0)).plain + (own.fields - own.plain)
 
     @property
     def lighting(self) -> Lighting:

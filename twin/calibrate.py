@@ -20,7 +20,7 @@ from scipy.ndimage import gaussian_filter
 
 from estimation.features import compress
 from twin import retake
-from twin.assessing import Sample, levels_of, loaded, one_thread, opened
+from twin.assessing import Sample, levels_of, loaded, one_thread, opened, values_of
 from twin.chain import BLOCK, whole_blocks
 from twin.complaint import DesignError, shown
 from twin.corpus import Corpus
@@ -32,7 +32,7 @@ from twin.frame import versions
 from twin.imagined import Brightness, mean_variance, pictures
 from twin.pooled import each
 from twin.rendered import rendered
-from twin.train import LIKE, level_names, likeness_of
+from twin.train import LIKE, likeness_of
 
 Floats = NDArray[np.float64]
 Single = NDArray[np.float32]
@@ -79,7 +79,7 @@ def calibrate(
     numbers = [int(n) for n in source.samples if source.plan.inclusion(int(n)) is not None][:samples]
     if len(numbers) < LEAST:
         raise DesignError("samples", shown(len(numbers)), f"{LEAST} or more inclusions", source=source.name)
-    made_of = (estimator.card["sha256"], source.plan.digest, versions())
+    made_of = ("of the whole design", estimator.card["sha256"], source.plan.digest, versions())
     key = hashlib.sha256(repr(made_of).encode()).hexdigest()
     folder = place.with_name(place.stem + ".parts") / f"rendered-{key[:16]}"
     folder.mkdir(parents=True, exist_ok=True)
@@ -91,7 +91,7 @@ def calibrate(
 
     share(0)
     each(compare, left, workers or os.cpu_count() or 1, one_thread, share)
-    values = [level_names(_values(source, number), levels) for number in numbers]
+    values = [values_of(source, estimator, number, levels) for number in numbers]
     seen, own = (np.stack(each_of) for each_of in zip(*map(_read, tasks), strict=True))
     tared, off = own[:, :, 0] - own[:, :, 1], seen - own
     shares = [
@@ -152,10 +152,6 @@ def _read(task: Sample) -> tuple[Single, Single]:
         return file["seen"], file["rendered"]
 
 
-def _values(source: Corpus, number: int) -> dict[str, float]:
-    return {k: v for k, v in source.plan.parameters(number).items() if v is not None}
-
-
 def compare(task: Sample) -> None:
     """Keep what a corpus has of a sample, without noise, beside what the model renders; runs in a worker."""
     estimator, source = loaded(task.model), opened(task.corpus)
@@ -170,7 +166,7 @@ def compare(task: Sample) -> None:
         [coarse(layers(task.number, level)) for layers in (source.layers, source.reference_layers)]
         for level in levels
     ]
-    values = level_names(_values(source, task.number), levels)
+    values = values_of(source, estimator, task.number, levels)
     own = rendered(estimator.chain, estimator.traced, values, threads=1)
     part = task.place.with_name(f".{task.place.name}.{os.getpid()}.part.npz")
     np.savez(part, seen=np.asarray(seen, np.float32), rendered=own)

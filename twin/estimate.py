@@ -16,7 +16,7 @@ from twin.frame import versions
 from twin.received import Received, wanted_of
 from twin.receiving import receive
 from twin.report import write_json
-from twin.stage import staged
+from twin.stage import has_keys, staged
 
 RECORD, PICTURE = "estimate.json", "overview.png"
 
@@ -126,7 +126,7 @@ def _estimate(
 def holds_estimate(folder: Path) -> bool:
     """Return whether a folder holds what `fill` wrote, and nothing else."""
     names = {entry.name for entry in folder.iterdir()}
-    return RECORD in names and names <= {RECORD, PICTURE}
+    return names <= {RECORD, PICTURE} and has_keys(folder / RECORD, "presence", "likeness")
 
 
 def fill(found: Found, folder: Path) -> None:

@@ -99,12 +99,14 @@ def prepare(
         if emulator is None and before.emulator is None:  # one that came since would judge otherwise
             found = replace(found, emulator=None)
     url = storage or explore_folder.own_database(folder)
-    made = replace(found, folder=folder, url=url, trials=trials or found.trials)
+    made = replace(found, folder=folder, url=url)
     head = explore_folder.head_of(made.design, storage, made.trials, made.emulator)
     if before is not None:
         explore_folder.check_same(folder, before, head, made.design)
     with explore_folder.making(folder):
         optuna_study = opened(made)
+        if before is not None and url != (before.storage or explore_folder.own_database(folder)):
+            explore_folder.check_moved(folder, before, url, len(optuna_study.get_trials(deepcopy=False)))
         explore_folder.write(folder, source.text, made.design, head)
     _enqueue(made, optuna_study)
     return made
@@ -177,7 +179,12 @@ def _emulator(
         return None
     made = layout_fields.base(study, design)
     known = presses.emulator_of(made.design, file)
-    for ball in study.balls():
+    places = [
+        replace(ball, offset=(ball.offset[0] - x, ball.offset[1] - y))
+        for ball in study.balls()
+        for x, y in made.protocol.positions_mm
+    ]
+    for ball in places:
         try:
             presses.check_emulated(made.design, ball, made.protocol.indentation_mm, known)
         except fem.NotModelled as error:

@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import re
+import tomllib
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -17,7 +18,7 @@ from pydantic.dataclasses import dataclass
 
 from scenes import ies
 from twin.complaint import DesignError, shown
-from twin.design import Design, load_design
+from twin.design import Design, parse_design
 from twin.explored import design_toml
 from twin.fields import flat, tables_of
 from twin.stage import usable
@@ -90,7 +91,11 @@ def head(folder: Path) -> Head:
 
 def check_same(folder: Path, before: Head, now: Head, design: Design) -> None:
     """Refuse to go on with another sensor or another emulator than a folder's layouts were judged with."""
-    there = load_design(folder / BASE)
+    tables = tomllib.loads((folder / BASE).read_text(encoding="utf-8"))
+    for led, own in zip(tables["leds"], design.leds, strict=False):
+        if led.get("ies") is not None and own.ies is not None:
+            led["ies"] = own.ies  # compared by what they say, wherever they lie now
+    there = parse_design(tables, str(folder / BASE))
     old, new = (_told(one, each) for one, each in ((there, before), (design, now)))
     for field in sorted(set(old) | set(new)):
         if old.get(field) != new.get(field):
@@ -106,6 +111,14 @@ def check_same(folder: Path, before: Head, now: Head, design: Design) -> None:
     received = f"{shown(str(folder))}, the folder of another emulator"
     allowed = f"a new folder, or {'no emulator' if before.emulator is None else before.emulator} as it was"
     raise DesignError("--out", received, allowed)
+
+
+def check_moved(folder: Path, before: Head, url: str, known: int) -> None:
+    """Refuse another storage that knows no layout where a folder holds some: they would be overwritten."""
+    if not known and any((folder / TRIALS).glob("*")):
+        there = hidden(before.storage or own_database(folder))
+        allowed = f"{there}, which knows the layouts of that folder, or a new folder"
+        raise DesignError("--storage", hidden(url), allowed)
 
 
 def _told(design: Design, said: Head) -> dict[str, Any]:

@@ -34,7 +34,7 @@ DEPTH = "press.indentation_mm"
 """All press depths together: with a relative prior, their scale."""
 _STEP = 0.1  # of the prior's sd, at most
 _MOST = {"size_mm": 0.1, "depth_mm": 0.1, "modulus_kPa": 2.0, "offset_x_mm": 0.1, "offset_y_mm": 0.1}
-_MOST_RELATIVE = 0.02
+_MOST_RELATIVE, _MOST_OF_INCLUSION = 0.02, 0.1
 
 
 @dataclass(frozen=True)
@@ -163,6 +163,8 @@ def step_of(unknown: Unknown, value: float) -> float:
     if unknown.relative:
         return min(_STEP * unknown.sd, _MOST_RELATIVE)
     most = _MOST[unknown.name] if unknown.name in _MOST else _MOST_RELATIVE * abs(value)
+    if unknown.name in INCLUSION[:3]:  # an inclusion has a size, a depth and a modulus above 0
+        most = min(most, _MOST_OF_INCLUSION * value)
     return min(_STEP * unknown.sd, most)
 
 

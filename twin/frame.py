@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from fem import Inclusion
 from twin.design import Design
-from twin.stage import staged
+from twin.stage import has_keys, staged
 
 if TYPE_CHECKING:
     import pyvista
@@ -173,7 +173,7 @@ def holds_frames(folder: Path) -> bool:
 
 def _holds_one_frame(folder: Path) -> bool:
     names = {entry.name for entry in folder.iterdir()}
-    return RECORD in names and names <= FILES | {MEAN}
+    return names <= FILES | {MEAN} and has_keys(folder / RECORD, "design", "versions")
 
 
 def _write(frame: Frame, folder: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -21,6 +22,7 @@ from twin.complaint import DesignError, shown
 from twin.design import Design
 from twin.fields import expand, tables_of
 from twin.plan import Plan
+from twin.pooled import ENDED
 from twin.retake import squares
 from twin.settling import Setting, drawn
 from twin.study import PARAMETERS, parse_study
@@ -80,12 +82,15 @@ def inputs_of(
     """Return the light map's inputs (n, levels, 2, k) of specimens."""
     parts = [values[at : at + _AT_ONCE] for at in range(0, len(values), _AT_ONCE)]
     found = []
-    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
-        jobs = pool.map(_contacts, [(chain.design, str(emulator), part) for part in parts])
-        for number, one in enumerate(jobs, start=1):
-            inputs = chain.light.inputs(one.reshape(-1, one.shape[-1]))
-            found.append(inputs.reshape(*one.shape[:3], -1))
-            tell(number / len(parts))
+    try:
+        with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
+            jobs = pool.map(_contacts, [(chain.design, str(emulator), part) for part in parts])
+            for number, one in enumerate(jobs, start=1):
+                inputs = chain.light.inputs(one.reshape(-1, one.shape[-1]))
+                found.append(inputs.reshape(*one.shape[:3], -1))
+                tell(number / len(parts))
+    except BrokenProcessPool:
+        raise ChildProcessError(ENDED) from None
     return np.concatenate(found)
 
 

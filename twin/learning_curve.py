@@ -17,16 +17,16 @@ from numpy.typing import NDArray
 import fem
 from twin import assessing_report
 from twin.assess import LEAST_MM, stored
-from twin.assessing import KEPT, free, levels_of
+from twin.assessing import KEPT, free, levels_of, values_of
 from twin.complaint import DesignError, shown
 from twin.corpus import Corpus
 from twin.estimates import NAMES
 from twin.estimator import Estimator
 from twin.estimator_file import load_estimator
-from twin.fitting import fit
+from twin.fitting import fit, limits
 from twin.report import BLUE, GREY, RED, panels, write_json
 from twin.stage import usable
-from twin.train import Seen, gather, learn_light, level_names, of_levels
+from twin.train import Seen, gather, learn_light, of_levels
 
 RECORD, PICTURE = assessing_report.CURVE, assessing_report.CURVED
 SIZES = (40, 80, 134, 250, 500, 1000, 2000)
@@ -62,10 +62,12 @@ def curve(
             raise DesignError("--out", shown(str(folder)), "a new or empty folder, or that of an assessment")
         folder.mkdir(parents=True, exist_ok=True)
         (folder / KEPT).touch()
-    seen = gather(source, estimator.chain.emulator, folder, lambda share: progress("pictures", share))
+    parts = folder / f"curve-{estimator.card['sha256'][:16]}"  # contacts are of this model's emulator
+    parts.mkdir(exist_ok=True)
+    seen = gather(source, estimator.chain.emulator, parts, lambda share: progress("pictures", share))
     seen = Seen(
         seen.numbers,
-        [level_names(one, levels) for one in seen.values],
+        [values_of(source, estimator, int(number), levels) for number in seen.numbers],
         seen.blank,
         seen.contacts[:, levels],
         seen.charges[:, levels],
@@ -83,7 +85,9 @@ def curve(
     bound = np.full(truth.shape, np.nan)
     for place, row in enumerate(last):
         try:
-            bound[place] = np.sqrt(np.diag(estimator.limits(seen.values[row], 1)[0])[: len(NAMES)])
+            # of the fits below, which know of no calibration
+            least, _ = limits(estimator.chain, estimator.features, estimator.prior, seen.values[row], 1)
+            bound[place] = np.sqrt(np.diag(least)[: len(NAMES)])
         except fem.NotModelled:
             continue
     design, rows = of_levels(source, levels), []

@@ -18,7 +18,7 @@ from twin.fields import flat
 from twin.mapping import MOST, Mapped, labels, map_corpus, open_corpus
 from twin.mapping_verdict import AtThreshold, area_r2, at_thresholds, headline, verdict
 from twin.report import Page, digits, write_csv, write_json
-from twin.stage import staged
+from twin.stage import has_keys, staged
 from twin.thresholds import PICTURE_STEPS, SIGMAS, Swept, sweep
 
 if TYPE_CHECKING:
@@ -122,7 +122,7 @@ def differences(corpora: Sequence[Corpus]) -> list[list[str]]:
 
 def write(found: Sequence[One], out: str | Path) -> None:
     """Write report.html, map.csv, thresholds.csv and map.json into a folder, all or nothing."""
-    with staged(out, lambda folder: {entry.name for entry in folder.iterdir()} <= FILES) as folder:
+    with staged(out, _holds_map) as folder:
         write_csv(folder / "map.csv", [one.row() for each in found for one in each.maps])
         write_csv(
             folder / "thresholds.csv",
@@ -134,6 +134,11 @@ def write(found: Sequence[One], out: str | Path) -> None:
         )
         write_json(folder / "map.json", as_json(found))
         page(found).write(folder / "report.html")
+
+
+def _holds_map(folder: Path) -> bool:
+    """Whether a folder holds what `write` wrote, and nothing else."""
+    return {entry.name for entry in folder.iterdir()} <= FILES and has_keys(folder / "map.json", "corpora")
 
 
 def as_json(found: Sequence[One]) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 
 Task = TypeVar("Task")
 
+ENDED = "a worker process was ended from outside, perhaps for memory"
 _ORPHAN_S = 1.0
 
 
@@ -37,7 +38,7 @@ def each(
                 one.result()
                 tell(count)
         except BrokenProcessPool:
-            raise ChildProcessError("a worker process was ended from outside, perhaps for memory") from None
+            raise ChildProcessError(ENDED) from None
         except BaseException:
             processes = list((pool._processes or {}).values())  # Python 3.14 has terminate_workers
             pool.shutdown(wait=False, cancel_futures=True)

@@ -17,6 +17,7 @@ from rich.table import Table
 from twin.doctor import STANDARD, Checkup, Exposure
 from twin.findings import CLOSURE_PERCENT, RANKS, SATURATED, Finding
 from twin.frame import versions
+from twin.stage import has_keys
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -122,7 +123,7 @@ def fill(checkup: Checkup | None, found: Sequence[Finding], name: str, folder: P
 def holds_checkup(folder: Path) -> bool:
     """Whether a folder holds what `fill` wrote, and nothing else."""
     names = {entry.name for entry in folder.iterdir()}
-    return RECORD in names and names <= {RECORD, PICTURE}
+    return names <= {RECORD, PICTURE} and has_keys(folder / RECORD, "findings", "versions")
 
 
 def show(checkup: Checkup | None, found: Sequence[Finding], name: str, *, as_json: bool = False) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 from twin import learned
 from twin.complaint import DesignError, shown
 from twin.planned import PLAN, load_plan, sha256
-from twin.stage import staged
+from twin.stage import has_keys, staged
 
 CORPUS = "corpus"
 """Folder under OUT that holds the corpus where none was given."""
@@ -97,7 +97,7 @@ def simulate(
         if emulator is not None and (planned is None or file is None or sha256(file) != planned):
             there = "without it" if planned is None else "with another emulator"
             raise DesignError("--emulator", f"a corpus planned {there}", "another folder", source=str(folder))
-        if solve and planned is not None:
+        if solve and emulator is None and planned is not None:
             raise DesignError(
                 "--solve", "a corpus planned with an emulator", "another folder", source=str(folder)
             )
@@ -121,7 +121,9 @@ def _check(out: str | Path, target: Path) -> None:
     allowed = "a new or empty folder, or one that holds an earlier replication and nothing else"
     if target.is_symlink() or (target.exists() and not target.is_dir()):
         raise DesignError("--out", f"{shown(str(out))}, which is not a folder", allowed)
-    if target.is_dir() and not {entry.name for entry in target.iterdir()} <= {*FILES, CORPUS}:
+    inside = {entry.name for entry in target.iterdir()} if target.is_dir() else set()
+    ours = has_keys(target / FILES[-1], "parameters", "paper")
+    if not inside <= {*FILES, CORPUS} or (inside & set(FILES) and not ours):
         raise DesignError("--out", f"{shown(str(out))}, which holds something else", allowed)
 
 
