@@ -231,6 +231,15 @@ def test_a_folder_with_luminaires_may_be_moved(tmp_path: Path) -> None:
         explore.prepare(there / "mine.toml", there / "out")
 
 
+def test_layouts_judged_in_other_light_are_not_gone_on_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    prepared(tmp_path)
+    monkeypatch.setattr(explore_folder, "LIGHT", explore_folder.LIGHT + 1)
+    with pytest.raises(DesignError, match=r"--out: .*another version of the light"):
+        prepared(tmp_path)
+
+
 def test_a_storage_that_knows_nothing_of_the_folder_does_not_overwrite_it(tmp_path: Path) -> None:
     explore.work(prepared(tmp_path, trials=3), evaluate=evaluated)
     before = all_of(tmp_path / "out")

@@ -17,6 +17,8 @@ from pydantic import Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
 from scenes import ies
+from scenes.traced import LIGHT
+from scenes.view import SIGHT
 from twin.complaint import DesignError, shown
 from twin.design import Design, parse_design
 from twin.explored import design_toml
@@ -42,6 +44,8 @@ class Head:
     emulator: str | None
     emulator_sha256: str | None = None
     luminaires: tuple[str | None, ...] | None = None
+    light: tuple[int, int] | None = None
+    """Versions of the light that layouts are judged in: `scenes.traced.LIGHT`, `scenes.view.SIGHT`."""
 
 
 _HEAD = TypeAdapter(Head)
@@ -51,7 +55,9 @@ def head_of(design: Design, storage: str | None, trials: int, emulator: Path | N
     """What a folder is to say of an exploration."""
     told = None if emulator is None else _sha256(emulator)
     lamps = tuple(None if led.ies is None else ies.digest(led.ies) for led in design.leds)
-    return Head(storage, trials, None if emulator is None else str(emulator.resolve()), told, lamps)
+    return Head(
+        storage, trials, None if emulator is None else str(emulator.resolve()), told, lamps, (LIGHT, SIGHT)
+    )
 
 
 def earlier(folder: Path, text: str) -> Head | None:
@@ -102,6 +108,9 @@ def check_same(folder: Path, before: Head, now: Head, design: Design) -> None:
             received = f"{shown(str(folder))}, the folder of another sensor"
             allowed = f"a new folder, or {field} = {shown(old.get(field))} as there"
             raise DesignError("--out", f"{received} ({field} is now {shown(new.get(field))})", allowed)
+    if before.light not in (None, now.light):
+        received = f"{shown(str(folder))}, whose layouts were judged by another version of the light"
+        raise DesignError("--out", received, "a new folder")
     known = before.emulator_sha256
     if known is None and before.emulator is not None:
         with suppress(OSError):  # one that is gone cannot be compared, but its layouts can be read

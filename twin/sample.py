@@ -195,10 +195,13 @@ def _shared(place: str, name: str) -> _Reference | None:
 
 def _key(plan: Plan, contact: Contact, light: int) -> str:
     """Return a name for all that decides a reference: the same name, the same bytes."""
+    from scenes.traced import LIGHT
+    from scenes.view import SIGHT
+
     told = hashlib.sha256()
     head = plan.head  # its design, not that of the sample, which knows where the corpus lies
     told.update(repr((head.design_sha256, sorted(head.ies.items()))).encode())
-    told.update(repr((plan.light, light, contact.level_mm)).encode())
+    told.update(repr((plan.light, light, contact.level_mm, LIGHT, SIGHT)).encode())
     if head.traced is not None:
         told.update(head.traced.sha256.encode())
     for array in (contact.surface.points, contact.surface["pressure_0"], contact.surface["displacement_0"]):
