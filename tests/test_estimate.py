@@ -118,6 +118,7 @@ def test_a_real_cameras_pictures_arrive(use, tmp_path, capsys):
     assert "modulus" in capsys.readouterr().out
 
 
+KEPT = json.dumps({"presence": 0.5, "likeness": 0.5})
 REFUSALS = {
     "unlike": ([], "pictures unlike the model's"),
     "no pictures": (["--frames", "2"], "3 frames"),
@@ -135,14 +136,14 @@ def test_refusals_are_one_line_and_leave_nothing(case, use, frames, tmp_path, ca
     for out in (tmp_path / "new" / "answer", tmp_path / "earlier"):
         if out.name == "earlier":
             out.mkdir()
-            (out / "estimate.json").write_text("kept")
+            (out / "estimate.json").write_text(KEPT)
         assert cli.main(["estimate", "model", str(frames), *more, "--out", str(out)]) == 2
         said = capsys.readouterr()
         assert said.out == "" and word in said.err
         assert [line for line in said.err.splitlines() if line.startswith("twin estimate: ")] == [
             said.err.splitlines()[-1]
         ]
-    assert (tmp_path / "earlier" / "estimate.json").read_text() == "kept"
+    assert (tmp_path / "earlier" / "estimate.json").read_text() == KEPT
     assert [place.name for place in tmp_path.iterdir()] == ["earlier"]
 
 
