@@ -25,6 +25,7 @@ from .faces import CONTACT, HOUSING, NOTHING, TO_AIR, TO_GLASS, Faces, Meeting
 from .housing import Tally
 from .sensor import Sensor
 from .view import PixelRays, below_mm
+from .windows import by_own_window
 
 Array = NDArray[np.float64]
 
@@ -263,7 +264,7 @@ def exact(
         survive = trace.chance(kept, bounce)
         alive = alive & (kept > 0.0) & (random.next_float32() < survive) & (bounce < trace.MAX_BOUNCES)
         passed = alive & ~touches & (met.cosine * dr.dot(following.d, met.normal) < 0.0)
-        leg = trace.next_leg(leg, met.kind, passed, trace.by_own_window(sensor, number, met))
+        leg = trace.next_leg(leg, met.kind, passed, by_own_window(sensor, number, met))
         if in_one:
             dips = passed & (met.kind == TO_GLASS) & (following.d.z < 0.0)
             following, mirrored, dips = _mirrored_below(sensor, following, dips)

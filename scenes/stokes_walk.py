@@ -21,7 +21,8 @@ from .bsdf import Table
 from .faces import CONTACT, LED, NOTHING, TO_AIR, TO_GLASS, WALL, Faces
 from .irradiance import AngularBasis
 from .sensor import Sensor
-from .trace import CELLS, MAX_BOUNCES, SINKS, absorb, bounce_off, chance, painted
+from .trace import CELLS, MAX_BOUNCES, SINKS, absorb, bounce_off, chance
+from .windows import painted
 
 Array = NDArray[np.float64]
 

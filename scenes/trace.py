@@ -26,6 +26,7 @@ from .irradiance import Layered, look_up
 from .lamp import Patterns
 from .sensor import Sensor
 from .tissue import Coupling
+from .windows import by_own_window, painted
 
 Array = NDArray[np.float64]
 
@@ -368,33 +369,9 @@ def leaves(sensor: Sensor, met: Meeting) -> mi.Bool:
     return outwards & (met.cosine < 0.0)
 
 
-def painted(sensor: Sensor, met: Meeting, active: mi.Bool) -> mi.Bool:
-    """Where walls are painted: all over, but for the windows before LEDs in air."""
-    half, found = sensor.guide.width_mm / 2, active & (met.kind == WALL)
-    for led in sensor.leds:
-        if led.coupling == "air" and led.side != "below":
-            centre, axis, _ = led_frame(led, half)
-            middle = mi.Point3f(*(centre + led.gap_mm * axis).tolist())
-            found = found & (dr.squared_norm(met.p - middle) > led.window_mm**2)
-    return found
-
-
 def is_gathered(leg: mi.UInt32) -> mi.Bool:
     """Whether `direct` counts light that comes to the contact on this leg."""
     return (leg == IN_GUIDE) | (leg == _BACK_UP)
-
-
-def by_own_window(sensor: Sensor, number: mi.UInt32, met: Meeting) -> mi.Bool:
-    """Where light of these LEDs may enter that `direct` gathers: in painted walls, by its own window."""
-    if sensor.guide.walls == "polished":
-        return mi.Bool(True)
-    half, found = sensor.guide.width_mm / 2, mi.Bool(False)
-    for k, led in enumerate(sensor.leds):
-        if led.coupling == "air" and led.side != "below":
-            centre, axis, _ = led_frame(led, half)
-            middle = mi.Point3f(*(centre + led.gap_mm * axis).tolist())
-            found = found | ((number == k) & (dr.squared_norm(met.p - middle) <= led.window_mm**2))
-    return found
 
 
 def next_leg(leg: mi.UInt32, kind: mi.UInt32, passed: mi.Bool, own: mi.Bool | bool = True) -> mi.UInt32:
