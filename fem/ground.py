@@ -31,8 +31,9 @@ from fem.topology import Resolution
 Floats = NDArray[np.float64]
 
 _GROWTH = (0.7, 1.6)  # of the fine mesh's cells towards the probe's edge, and beyond it
-_LEAN = (0.6, 2.0)  # the lean mesh's, up to the first strain and from the second one: cells that shrink less
-_STRAIN = (0.12, 0.2)  # give way later, and ripple more towards the edge
+# The lean mesh's, up to the first strain and from the second one: cells that shrink less give way later, and
+# ripple more towards the edge.
+_LEAN, _STRAIN = (0.6, 2.0), (0.12, 0.2)
 _DEGREE = 4  # of the share of finite strain, along x and y
 _WITHIN = (
     0.91  # of the probe's half width, where it is learned: beyond, cells of the lean mesh tell of themselves
@@ -65,7 +66,7 @@ def fine(res: Resolution) -> Resolution:
     )
 
 
-def lean(res: Resolution, strain: float = 0.0) -> Resolution:
+def lean(res: Resolution, strain: float) -> Resolution:
     """Mesh of what finite strain changes, at an indentation over the slab's thickness.
 
     It changes with that little by little, so that pressure does not jump.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -177,15 +178,10 @@ class Work:
     def lump(self, ball: fem.Inclusion, level: float) -> NDArray[Any]:
         """Contact fields of an inclusion without any slopes."""
         work = replace(self, unknowns=())
-        try:
-            own = work._touch(ball, level, (0.0, 0.0))
-        except fem.NotModelled:  # beyond what an emulator of another width or tissue knows
-            if self.emulator is None:
-                raise
-            own = replace(work, emulator=None)._touch(ball, level, (0.0, 0.0))
-        else:
-            if self.emulator is not None:
-                return own.fields
+        if self.emulator is not None:
+            with suppress(fem.NotModelled):  # an emulator of another width or tissue knows some of them only
+                return work._touch(ball, level, (0.0, 0.0)).fields
+        own = replace(work, emulator=None)._touch(ball, level, (0.0, 0.0))
         return work._touch(self.ground, level, (0.0, 0.0)).plain + (own.fields - own.plain)
 
     @property
