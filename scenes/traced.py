@@ -40,8 +40,8 @@ LIGHT = 9
 9: windows of other LEDs in painted walls, thin sheets that hardly scatter (see `version`)."""
 BIAS_SINCE = 5
 """The first light of which a quality's measured bias holds: what changed since is common to all qualities, or
-less than the bias is known to (LIGHT 7, 8: 0.11 % in a blob, 0.09 % in a background), or touches no design that
-was measured (9)."""
+less than the bias is known to (LIGHT 7, 8: 0.11 % in a blob, 0.09 % in a background), or touches no measured
+design (9)."""
 ARRAYS = ("centre", "axes", "nodes", "weights", "mean", "modes")
 """Fields of `TracedLight` that are arrays."""
 
