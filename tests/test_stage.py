@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from twin import export, export_optics, exporting, plan
+from twin import estimate, export, export_optics, exporting, frame, mapping_report, plan, prescription
 from twin.complaint import DesignError
 from twin.stage import staged
 
@@ -24,6 +24,10 @@ OURS = {
     "decks": (export._holds_decks, {"README.txt": export.README, "with.inp": ""}),
     "scene": (export_optics._is_ours("mitsuba"), {"README.txt": export_optics._MITSUBA_README}),
     "meshes": (export_optics._is_ours("stl"), {"README.txt": export_optics._MESH_README, "guide.stl": ""}),
+    "estimate": (estimate.holds_estimate, {"estimate.json": json.dumps({"presence": 1, "likeness": 1})}),
+    "check": (prescription.holds_checkup, {"check.json": json.dumps({"findings": [], "versions": {}})}),
+    "frame": (frame.holds_frames, {"frame.json": json.dumps({"design": "a", "versions": {}})}),
+    "map": (mapping_report._holds_map, {"map.json": json.dumps({"corpora": []})}),
 }
 OTHERS = {
     "plan": {"plan.json": json.dumps({"my": "plan"})},
@@ -32,6 +36,10 @@ OTHERS = {
     "decks": {"README.txt": "My own words"},
     "scene": {"README.txt": "My own words"},
     "meshes": {"README.txt": export_optics._MITSUBA_README},
+    "estimate": {"estimate.json": "mine"},
+    "check": {"check.json": "{}"},
+    "frame": {"frame.json": "[]"},
+    "map": {"map.json": json.dumps({"my": "map"})},
 }
 
 
