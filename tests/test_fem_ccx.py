@@ -26,6 +26,8 @@ SLAB = fem.Slab(30, 60, 5)
 COARSE_EDGE = Resolution(arc=3, core=1, shell=3, above=3, below=2, edge=2, side=2, layer=2, backing=1)
 # Its totals of a linear press need fine ones.
 FINE_EDGE = Resolution(4, 1, 4, 3, 2, edge=3, side=4, layer=3, backing=1, growth=(1 / 1.7, 2.2))
+# On those its force under an inclusion off the middle is 0.3 % higher than on these.
+FINER = Resolution(5, 1, 4, 3, 3, edge=4, side=5, layer=4, backing=2, growth=(1 / 1.7, 2.0))
 INCLUSIONS = [
     fem.Inclusion(10, 5, 100),
     fem.Inclusion(13, 6, 40),
@@ -82,10 +84,11 @@ def test_linear_at_a_glance(tmp_path: Path) -> None:
 
 @needs_ccx
 @pytest.mark.slow
+@pytest.mark.timeout(1200)
 @pytest.mark.parametrize("inclusion", INCLUSIONS, ids=str)
 def test_linear(tmp_path: Path, inclusion: fem.Inclusion) -> None:
     geometry = Geometry(PROBE, SLAB, inclusion)
-    ((top, total, force, _),) = compared(tmp_path, geometry, [1.0], "linear", "standard", FINE_EDGE)
+    ((top, total, force, _),) = compared(tmp_path, geometry, [1.0], "linear", "standard", FINER)
     assert abs(top) < 5e-3 and abs(total) < 5e-3 and abs(force) < 5e-3
 
 
@@ -117,15 +120,19 @@ def test_finite(tmp_path: Path, inclusion: fem.Inclusion, level: float) -> None:
 
 @needs_ccx
 @pytest.mark.slow
-@pytest.mark.timeout(3000)
+@pytest.mark.timeout(7200)
+@pytest.mark.parametrize("inclusion", INCLUSIONS, ids=str)
 @pytest.mark.parametrize(
     "probe, tilt",
     [(fem.Probe(25, PROBE.layers, dome_radius_mm=150), (0.0, 0.0)), (PROBE, (0.0, 2.0))],
     ids=["dome", "tilt"],
 )
-def test_finite_where_contact_spreads(tmp_path: Path, probe: fem.Probe, tilt: tuple[float, float]) -> None:
-    geometry = Geometry(probe, SLAB, INCLUSIONS[0], Pose(tilt))
-    for top, _, *others in compared(tmp_path, geometry, [1.0, 2.0], "finite", "standard", COARSE_EDGE):
+def test_finite_where_contact_spreads(
+    tmp_path: Path, probe: fem.Probe, tilt: tuple[float, float], inclusion: fem.Inclusion
+) -> None:
+    geometry = Geometry(probe, SLAB, inclusion, Pose(tilt))
+    levels = [1.0, 2.0] if inclusion == INCLUSIONS[0] else [1.0]
+    for top, _, *others in compared(tmp_path, geometry, levels, "finite", "standard", COARSE_EDGE):
         assert max(map(abs, (top, *others))) < 0.03
 
 

@@ -15,11 +15,12 @@ import ccx_runner
 import numpy as np
 import pytest
 from debian_fetch import CCX
-from lone_press import BALL, LEVEL_MM, PROBE, SLAB
+from lone_press import BALL, LEVEL_MM, PROBE, SLAB, by_ours
 from test_fem_convergence import REFINED
 
 import fem
 from fem.mesh import QUALITIES, Geometry
+from fem.solver import Factor
 from fem.topology import Resolution
 
 ERROR_PERCENT = 1.5
@@ -147,6 +148,28 @@ def draw(ladders: dict[str, list[Run]], expected: float) -> Path:
     return OUT / "mechanics_speed.png"
 
 
+def factoring(res: Resolution) -> float:
+    """Seconds that element matrices and Cholesky factor take of a press of ours, all else warm: what no method
+    that factors a matrix of this size can do without."""
+    spent = [0.0]
+    plain = Factor._factorise
+
+    def timed(self: Factor, progress: Callable[[float], None] | None) -> None:
+        start = time.perf_counter()
+        plain(self, progress)
+        spent[0] += time.perf_counter() - start
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Factor, "_factorise", timed)
+        by_ours(res)
+        best = np.inf
+        for _ in range(3):
+            spent[0] = 0.0
+            by_ours(res)
+            best = min(best, spent[0])
+    return float(best)
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 def test_linear_at_equal_error(ladders: dict[str, list[Run]], expected: float) -> None:
@@ -161,8 +184,13 @@ def test_linear_at_equal_error(ladders: dict[str, list[Run]], expected: float) -
         ratios[name] = theirs / ours
         word = ", a lower bound: no mesh reached it" if bound else ""
         print(f"  {name}: {theirs:.1f} s, ratio {theirs / ours:.1f} (goal {PEER_GOAL:.0f}){word}")
+        if name == "CalculiX":
+            floor = factoring(CHEAPEST)
+            print(
+                f"    the factor of ours alone takes {floor:.2f} s: were all else free, {theirs / floor:.1f} times"
+            )
     # Beside CalculiX the goal is missed, and not asserted: its brick with reduced integration is about as
-    # accurate and as quick as ours.
+    # accurate and as quick as ours, and a factor of the least mesh alone takes longer than a fifteenth of it.
     assert all(ratio >= PEER_GOAL for name, ratio in ratios.items() if name != "CalculiX")
 
 
