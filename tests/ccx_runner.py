@@ -13,7 +13,6 @@ import numpy as np
 import pyvista as pv
 from debian_fetch import CCX
 from numpy.typing import NDArray
-from scipy.interpolate import RectBivariateSpline
 
 import fem
 from fem import ccx, surface
@@ -138,12 +137,26 @@ def tared(contact: pv.PolyData, middle: bool) -> dict[str, float]:
 
 
 def total_within(contact: pv.PolyData, half_mm: float) -> float:
-    """Integral of the tared displacement up to so far from the middle in x and y, mm³."""
+    """Integral of the tared displacement up to so far from the middle in x and y, mm³.
+
+    Exact for quadratic cells. A spline through their nodes would carry swings of the outermost ones inwards:
+    by 4 % of the total, where CalculiX's corners fold.
+    """
     tared = np.asarray(contact["displacement_0"])[:, 2] - np.asarray(contact["displacement"])[:, 2]
     x, y = (np.unique(np.round(contact.points[:, k], 6)) for k in (0, 1))
     order = np.lexsort((np.round(contact.points[:, 1], 6), np.round(contact.points[:, 0], 6)))
-    spline = RectBivariateSpline(x, y, tared[order].reshape(len(x), len(y)), kx=2, ky=2)
-    return float(spline.integral(-half_mm, half_mm, -half_mm, half_mm))
+    return float(_weights(x, half_mm) @ tared[order].reshape(len(x), len(y)) @ _weights(y, half_mm))
+
+
+def _weights(at: Floats, half: float) -> Floats:
+    """Of the nodes of quadratic cells in a line, two apart each, in the integral from -half to half."""
+    weights = np.zeros(len(at))
+    for i in range(0, len(at) - 2, 2):
+        nodes = at[i : i + 3]
+        ends = np.clip(nodes[[0, 2]], -half, half)
+        powers = np.array([np.diff(ends ** (k + 1))[0] / (k + 1) for k in range(3)])
+        weights[i : i + 3] += np.linalg.solve(np.vander(nodes, increasing=True).T, powers)
+    return weights
 
 
 def _symmetric(geometry: Geometry) -> tuple[bool, bool]:

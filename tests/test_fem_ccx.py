@@ -194,3 +194,18 @@ def test_numbers_are_short_enough_for_calculix(tmp_path: Path) -> None:
     end = next(i for i, line in enumerate(lines) if line.startswith("*ELEMENT"))
     table = np.array([[float(field[:20]) for field in line.split(",")] for line in lines[start + 1 : end]])
     np.testing.assert_allclose(table[:, 1:], found.place[table[:, 0].astype(int) - 1], rtol=0, atol=1e-9)
+
+
+def test_totals_are_those_of_quadratic_cells() -> None:
+    """Exact for polynomials in a cell, cut cells too; what a node at the rim does stays in its cell."""
+    line = np.array([-3, -2.5, -2, 0, 2, 2.5, 3])
+    contact = fem.surface.contact_surface(line, line)
+    x, y = contact.points[:, 0], contact.points[:, 1]
+    z = (1 + x + x**2) * (2 - y**2)
+    contact["displacement_0"] = np.stack([0 * z, 0 * z, z], axis=1)
+    contact["displacement"] = np.zeros((len(z), 3))
+    expected = (5 + 2 * 2.5**3 / 3) * (10 - 2 * 2.5**3 / 3)
+    assert ccx_runner.total_within(contact, 2.5) == pytest.approx(expected, rel=1e-12)
+    inner = ccx_runner.total_within(contact, 2.0)
+    contact["displacement_0"][np.abs(x) == 3] += 100
+    assert ccx_runner.total_within(contact, 2.0) == pytest.approx(inner, rel=1e-12)
