@@ -149,8 +149,8 @@ def draw(ladders: dict[str, list[Run]], expected: float) -> Path:
 
 
 def factoring(res: Resolution) -> float:
-    """Seconds that element matrices and Cholesky factors take of a press of ours, all else warm: what no method
-    that factors a matrix of this size does without."""
+    """Seconds that element matrices and Cholesky factors take of a press of ours, warm: what no method that
+    factors a matrix of this size does without."""
     spent = [0.0]
     plain = Factor._factorise
 
@@ -186,7 +186,7 @@ def test_linear_at_equal_error(ladders: dict[str, list[Run]], expected: float) -
         print(f"  {name}: {theirs:.1f} s, ratio {theirs / ours:.1f} (goal {PEER_GOAL:.0f}){word}")
         if name == "CalculiX":
             floor = factoring(CHEAPEST)
-            print(f"    our factor alone takes {floor:.2f} s: were all else free, {theirs / floor:.1f} times")
+            print(f"    our factor alone takes {floor:.2f} s: all else free, {theirs / floor:.1f} times")
     # Beside CalculiX the goal is missed, and not asserted: its brick with reduced integration is about as
     # accurate and as quick as ours, and a factor of the least mesh alone takes longer than a fifteenth of it.
     assert all(ratio >= PEER_GOAL for name, ratio in ratios.items() if name != "CalculiX")
