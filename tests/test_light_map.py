@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from estimation import light_map
 from estimation.light_map import _left_out, learn
 
 
@@ -42,6 +43,16 @@ def test_errors_left_out_are_those_of_new_samples():
     light, left = learn(contacts[:250], pictures[:250])
     new = light(contacts[250:]) - pictures[250:]
     assert np.sqrt((left**2).mean()) == pytest.approx(np.sqrt((new**2).mean()), rel=0.1)
+
+
+def test_more_than_length_and_ridge_are_chosen_with(monkeypatch: pytest.MonkeyPatch):
+    """All of them are learned from: as well as where all choose, and better than by the first alone."""
+    contacts, pictures = made_up(400, np.random.default_rng(4))
+    maps = {"all": learn(contacts[:300], pictures[:300])[0], "first": learn(contacts[:60], pictures[:60])[0]}
+    monkeypatch.setattr(light_map, "MOST", 60)
+    maps["chosen"] = learn(contacts[:300], pictures[:300])[0]
+    off = {name: np.abs(one(contacts[300:]) - pictures[300:]).max() for name, one in maps.items()}
+    assert off["chosen"] < 3 * off["all"] < off["first"]
 
 
 def test_too_few_are_refused():

@@ -92,7 +92,8 @@ def curve(
             continue
     design, rows = of_levels(source, levels), []
     for number, size in enumerate(sizes):
-        chain, errors = learn_light(design, estimator.chain.emulator, seen.of(pool[:size]))
+        most = 2 * size * seen.contacts.shape[1]
+        chain, errors = learn_light(design, estimator.chain.emulator, seen.of(pool[:size]), most)
         found = np.empty(truth.shape)
         for place in range(len(last)):
             found[place] = _most_probable(estimator, chain, errors, told[place], start[place])

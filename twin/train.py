@@ -304,13 +304,15 @@ def charges_of(source: Corpus, number: int, level: int) -> Single:
     return np.stack(found)
 
 
-def learn_light(design: Design, emulator: fem.Emulator, seen: Seen) -> tuple[Chain, Single]:
+def learn_light(
+    design: Design, emulator: fem.Emulator, seen: Seen, most: int = light_map.MOST
+) -> tuple[Chain, Single]:
     """Return the chain, and its errors of pictures left out, (n, levels, 2, r, c) counts of all LEDs.
 
-    No more samples are taken than `light_map.MOST` pictures come from.
+    No more samples are taken than `most` pictures come from.
     """
     levels = seen.contacts.shape[1]
-    seen = seen.of(np.arange(min(len(seen.numbers), light_map.MOST // (2 * levels))))
+    seen = seen.of(np.arange(min(len(seen.numbers), most // (2 * levels))))
     n = len(seen.numbers)
     light, left = light_map.learn(
         seen.contacts.reshape(n * levels * 2, -1),
