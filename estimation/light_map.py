@@ -71,7 +71,7 @@ def learn(
 ) -> tuple[LightMap, Single]:
     """Fit pictures (n, ...) of contacts (n, d); return also the errors of those left out, (n, ...).
 
-    The time goes with n³, a minute for 10 000, the memory with n²; length and ridge are chosen with the first
+    Time goes with n³, memory with n²: minutes and 5 GB for 12 000. Length and ridge are chosen with the first
     `MOST`.
 
     Parameters
@@ -112,7 +112,7 @@ def _modes(pictures: Single) -> tuple[Floats, Single]:
     """Amounts (n, m) and modes (m, pixels) that pictures (n, pixels) are made of, the leading ones."""
     products = np.asarray(pictures @ pictures.T, np.float64)
     count = min(_MODES, len(pictures) - 1, pictures.shape[1])
-    if len(pictures) > MOST:  # all eigenvalues of 12 000 pictures would take a quarter of an hour
+    if len(pictures) > MOST:  # all eigenvalues of many thousands take longer than the fit
         values, vectors = eigsh(products, count, v0=np.ones(len(pictures)))
     else:
         values, vectors = np.linalg.eigh(products)
@@ -122,9 +122,7 @@ def _modes(pictures: Single) -> tuple[Floats, Single]:
     return amounts, ((vectors[:, lead] / np.sqrt(values[lead])).T.astype(np.float32) @ pictures)
 
 
-def _error(
-    nodes: Floats, amounts: Floats, groups: NDArray[np.integer], length: float, ridge: float
-) -> float:
+def _error(nodes: Floats, amounts: Floats, groups: NDArray[np.integer], length: float, ridge: float) -> float:
     return float((_solved(nodes, amounts, groups, length, ridge)[1] ** 2).mean())
 
 

@@ -157,7 +157,7 @@ def _draw(record: dict[str, Any], place: Path) -> None:
         axis.set(xlabel="samples that light was learned from", ylabel=f"RMSE of {label}")
         axis.set_xticks(sizes, [str(size) for size in sizes])
         axis.minorticks_off()
-        axis.set_ylim(bottom=0.0)
+        axis.set_ylim(0.0, 1.1 * axis.get_ylim()[1])
         axis.grid(color=GREY, alpha=0.3)
     axes[0].legend(frameon=False, fontsize=8)
     figure.savefig(place, dpi=130)
