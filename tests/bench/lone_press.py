@@ -1,6 +1,6 @@
 """One linear press in a process of its own, by ours or as one would write it with scikit-fem alone.
 
-`python lone_press.py METHOD ARC CORE ...` (the cells of a `Resolution`) prints one line of JSON: tared
+`python lone_press.py METHOD CELLS` (the fields of a `Resolution` as JSON) prints one line of JSON: tared
 maximum (mm), seconds with and without inclusion together, unknowns, and peak memory (GiB). METHOD is `ours`,
 or one of scikit-fem with quadratic tetrahedra and SciPy's sparse LU (SuperLU):
 
@@ -190,8 +190,9 @@ def by_ours(res: Resolution) -> tuple[float, int]:
 
 
 def main() -> None:
-    method, *cells = sys.argv[1:]
-    res = Resolution(*map(int, cells))
+    method, cells = sys.argv[1:]
+    told = json.loads(cells)
+    res = Resolution(**told | {"growth": tuple(told["growth"])})
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_GIB << 30, MEMORY_GIB << 30))
     import fem.pressing  # noqa: F401  neither side's imports count
 

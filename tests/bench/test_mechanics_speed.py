@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import ccx_runner
@@ -54,7 +54,7 @@ class Run:
 
 def lone(method: str, res: Resolution) -> Run:
     """A press in a process of its own, one thread."""
-    command = [sys.executable, str(FOLDER / "lone_press.py"), method, *map(str, res.__dict__.values())]
+    command = [sys.executable, str(FOLDER / "lone_press.py"), method, json.dumps(asdict(res))]
     env = os.environ | ALONE | {"PYTHONPATH": str(FOLDER.parent.parent)}
     start = time.perf_counter()
     try:
