@@ -95,13 +95,15 @@ def learn(
     nodes = (x - centre) @ axes
     mean = y.mean(axis=0)
     amounts, modes = _modes(y - mean)
-    fits = {
-        (length, ridge): _error(nodes[:MOST], amounts[:MOST], groups[:MOST], length, ridge)
+    tried = {
+        (length, ridge): _solved(nodes[:MOST], amounts[:MOST], groups[:MOST], length, ridge)
         for length in _LENGTHS
         for ridge in _RIDGES
     }
-    length, ridge = min(fits, key=lambda pair: fits[pair])
-    weights, left = _solved(nodes, amounts, groups, length, ridge)
+    length, ridge = min(tried, key=lambda pair: float((tried[pair][1] ** 2).mean()))
+    weights, left = tried[length, ridge]
+    if len(x) > MOST:
+        weights, left = _solved(nodes, amounts, groups, length, ridge)
     beyond = (y - mean) - amounts.astype(np.float32) @ modes  # of the modes that are not kept
     errors = left.astype(np.float32) @ modes + beyond
     fitted = LightMap(centre, axes, nodes, length, weights, mean, modes, shape[1:])
@@ -120,10 +122,6 @@ def _modes(pictures: Single) -> tuple[Floats, Single]:
     lead = lead[values[lead] > 1e-14 * values.max()]
     amounts = vectors[:, lead] * np.sqrt(values[lead])
     return amounts, ((vectors[:, lead] / np.sqrt(values[lead])).T.astype(np.float32) @ pictures)
-
-
-def _error(nodes: Floats, amounts: Floats, groups: NDArray[np.integer], length: float, ridge: float) -> float:
-    return float((_solved(nodes, amounts, groups, length, ridge)[1] ** 2).mean())
 
 
 def _solved(

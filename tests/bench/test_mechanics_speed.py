@@ -97,6 +97,13 @@ def time_at(runs: list[Run], expected: float) -> tuple[float, bool]:
     return float(np.exp(np.interp(np.log(ERROR_PERCENT), np.log(error[last]), np.log(seconds[last])))), False
 
 
+@pytest.mark.parametrize("method", ["ours", "P2/P1"])
+def test_a_lone_press_answers(method: str) -> None:
+    """Nothing but the slow tests below runs these, and they only print why one fails."""
+    run = lone(method, COARSEST)
+    assert not run.why and run.max_mm == pytest.approx(0.0128, rel=0.1)
+
+
 @pytest.fixture(scope="module")
 def expected() -> float:
     """Tared maximum on the refined mesh, mm."""
