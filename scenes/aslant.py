@@ -1,8 +1,8 @@
 """How light that enters aslant comes out, taken apart: by harmonics of the azimuth, and in each by a few
 functions of the cosine, so that it becomes a few smooth maps of light, each spread by a kernel of its own.
 
-The Fourier transform of where a beam comes out (`Slab.aslant`) depends on the wave number k, the cosine of
-entry µ and the azimuth φ between the beam and the wave; it is even in φ:
+The Fourier transform of where a beam comes out (`aslant` of `Slab` or `HalfSpace`) depends on the wave
+number k, the cosine of entry µ and the azimuth φ between the beam and the wave; it is even in φ:
 
     F(k, µ, φ) = Σ_m i^(m odd) cos mφ Σ_r X_mr(k) h_mr(µ).
 
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from .ftir import gap_transmittance
+from .half_space import TOP, HalfSpace
 from .slab import Slab, cosines
 
 Array = NDArray[np.float64]
@@ -39,22 +40,26 @@ _BLACK = 1e-12  # share that comes back, below which nothing does
 ALL, STEEP, DEEP, HELD = 0, 1, 2, 3
 """What is asked of the light that comes out: all of it; its radiance factor along the normal; the same times
 the depth of the last collision, mm; what skin throws back of it that nothing touches."""
+AHEAD, RISE, LEFT = 2, 4, 5
+"""Where scatterings favour a direction, in the place of `DEEP`, of the same factor beside the normal: its
+change per sine towards the wave over -i; per 1 - cosine; per sine to the left of the wave over -i, whose
+harmonics go with sin mφ."""
 
 
 @dataclass(frozen=True)
 class Aslant:
-    """The parts of `Slab.aslant`.
+    """The parts of the answer.
 
     Attributes
     ----------
     functions : by harmonic m, (r_m, n)
         h_mr on cosines in the tissue uniform on 0..1; in harmonic 0 the tissue's lobes φ_i come first.
-    transforms : by harmonic m, (4, r_m, K)
+    transforms : by harmonic m, (4 or 6, r_m, K)
         X_mr of what `ALL` leaves, over the transform of Lambertian light, of what leaves `STEEP`, and `DEEP`.
         Light that leaves not quite along the normal seems to come from behind, by that depth times the sine
         of the angle in the tissue. `HELD` as `ALL`: mostly grazing light is thrown back; it comes from less
         deep, so that what went in aslant is less far ahead. Its total is that of `ALL`: what more there is,
-        local modes have.
+        local modes have. Of a `HalfSpace` `AHEAD`, `RISE` and `LEFT` in the place of `DEEP`.
     """
 
     transport_per_mm: float
@@ -72,14 +77,19 @@ class Aslant:
 
 
 def aslant(
-    body: Slab, transport_per_mm: float, lobes: Array, refractive_index: float, gap_index: float
+    body: Slab | HalfSpace, transport_per_mm: float, lobes: Array, refractive_index: float, gap_index: float
 ) -> Aslant:
     """Take the answer of a body apart: `lobes` (modes, n) are its φ_i on cosines uniform on 0..1, the indices
     its own and that of what fills the gaps above it."""
-    top = max(_TOP, min(_THIN / body.depth, _FINEST_PER_MM / transport_per_mm))
-    beams, diffuse = _beams(body, refractive_index, gap_index, top)
+    if isinstance(body, HalfSpace):
+        top = TOP
+        beams, diffuse = _forward_beams(body, refractive_index, gap_index)
+    else:
+        top = max(_TOP, min(_THIN / body.depth, _FINEST_PER_MM / transport_per_mm))
+        beams, diffuse = _beams(body, refractive_index, gap_index, top)
     cosine, _ = cosines()
     by_harmonic = np.fft.fft(beams, axis=3) / _AZIMUTHS
+    by_harmonic[LEFT:] *= 1j  # sines
     peak = np.maximum(np.abs(beams).max(axis=(1, 2, 3)), _DARK)[:, None, None]
     seen = cosine / (cosine + _GRAZING)
     fine = 1.0 / (1.0 + (_waves(top) * transport_per_mm / _FINE_PER_MM) ** 1.5)[:, None]
@@ -97,10 +107,11 @@ def aslant(
         count = int(np.argmax(np.array(rest) <= _ENOUGH))
         shares = np.hstack([share, left[:, :count] * sizes[:count]]).reshape(DEEP, diffuse.size, -1)
         every = np.vstack([known, shapes[:count]])  # enough for depths, too: they are asked for a small part
-        more = [np.linalg.lstsq(every.T, values[what].T, rcond=None)[0].T for what in (DEEP, HELD)]
+        more = [np.linalg.lstsq(every.T, one.T, rcond=None)[0].T for one in values[DEEP:]]
         shares = np.concatenate([shares, more]) / fine * peak
         shares[[ALL, HELD]] /= np.maximum(diffuse, 1e-300)[:, None]
-        shares[DEEP] /= transport_per_mm
+        if isinstance(body, Slab):
+            shares[DEEP] /= transport_per_mm
         transforms.append(np.moveaxis(shares, 1, 2))
         # odd harmonics go with the sine of the angle, which no spline in the cosine follows to the normal
         sine = [np.sqrt(1.0 - values**2) if m % 2 else np.ones(values.size) for values in (cosine, grid)]
@@ -118,11 +129,45 @@ def _beams(
     beams, diffuse = slab.aslant(_waves(top), cosines()[0], azimuth), slab.reflectance(_waves(top))
     held = beams[ALL]
     if np.isinf(slab.depth) and diffuse[0] > _BLACK and gap_index < refractive_index:
-        gap = gap_index, gap_index, 0.0  # endless: any wavelength will do
-        t_s, t_p = gap_transmittance(refractive_index, *gap, cosines()[0], 550.0)
-        found = by_exit(beams[STEEP], 1.0 - 0.5 * (t_s + t_p))
-        held = (found - found[0]) * diffuse[:, None, None] + held[0] * (diffuse / diffuse[0])[:, None, None]
+        held = _held(by_exit(beams[STEEP], _thrown_back(refractive_index, gap_index)), held, diffuse)
     return np.concatenate([beams, held[None]]), diffuse
+
+
+@lru_cache(maxsize=16)
+def _forward_beams(
+    body: HalfSpace, refractive_index: float, gap_index: float
+) -> tuple[NDArray[np.complex128], Array]:
+    """The same of a `HalfSpace`, with `AHEAD`, `RISE` and `LEFT`; 6 s.
+
+    What few harmonics are off by where nothing varies along the face, up to 0.5 % of grazing light, is put
+    right by many.
+    """
+    mu, _ = cosines()
+    side = _AZIMUTHS // 2 + 1  # the other side is like it, but for what goes to the left
+    counts = _thrown_back(refractive_index, gap_index) if gap_index < refractive_index else np.ones(mu.size)
+    half = body.aslant(_waves(TOP), mu, 2.0 * np.pi * np.arange(side) / _AZIMUTHS, counts)
+    mirrored = half[..., -2:0:-1].copy()
+    mirrored[LEFT] *= -1.0
+    beams, diffuse = np.concatenate([half, mirrored], axis=-1), body.reflectance(_waves(TOP))
+    for what, exact in ((ALL, body.plane_albedo(mu)), (STEEP, body.factors(np.ones(1))[0])):
+        beams[what] *= (exact / beams[what, 0].mean(axis=-1).real)[None, :, None]
+    beams[HELD] = _held(beams[HELD], beams[ALL], diffuse) if gap_index < refractive_index else beams[ALL]
+    return beams, diffuse
+
+
+def _thrown_back(refractive_index: float, gap_index: float) -> Array:
+    """Share of light that skin throws back, where nothing touches it, at the Gauss cosines."""
+    gap = gap_index, gap_index, 0.0  # endless: any wavelength will do
+    t_s, t_p = gap_transmittance(refractive_index, *gap, cosines()[0], 550.0)
+    return np.asarray(1.0 - 0.5 * (t_s + t_p))
+
+
+def _held(
+    counted: NDArray[np.complex128], everything: NDArray[np.complex128], diffuse: Array
+) -> NDArray[np.complex128]:
+    """`HELD` from what is thrown back of beams' light over that of Lambertian light; its total as `ALL`."""
+    share = (diffuse / diffuse[0])[:, None, None]
+    return np.asarray((counted - counted[0]) * diffuse[:, None, None] + everything[0] * share)
 
 
 def by_exit(steep: NDArray[np.complex128], counts: Array) -> NDArray[np.complex128]:

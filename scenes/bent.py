@@ -25,7 +25,6 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from .slab import decay_rate
 from .tissue import TissueOptics
 
 Array = NDArray[np.float64]
@@ -75,7 +74,7 @@ def bent(tissue: TissueOptics, width_mm: float, cells: int) -> Bent:
     wave = np.clip(np.hypot(line, line[:, None]) / per_mm, _LEAST, _MOST)
     nodes = np.geomspace(_LEAST, _MOST, _NODES)
     flat = np.maximum(tissue.slab.reflectance(nodes), 1e-12)
-    decay, mean = decay_rate(tissue.slab.albedo), float(_EVEN.mean())
+    decay, mean = tissue.slab.decay_rate, float(_EVEN.mean())
     low, high = np.log(np.maximum(tissue.slab.reflectance(_EVEN), 1e-12))
     even = (high - low) / float(np.ptp(_EVEN)) * np.hypot(decay, mean) / mean / per_mm
     answer = even * 0.5 ** (wave**2 / (0.06 + 0.45 * decay**2))

@@ -13,7 +13,7 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from .aslant import ALL, DEEP, HELD, STEEP
+from .aslant import AHEAD, ALL, DEEP, HELD, LEFT, RISE, STEEP, Aslant
 from .tissue import Coupling
 
 Array = NDArray[np.float64]
@@ -33,15 +33,15 @@ class Face:
 
 @dataclass(frozen=True)
 class Glimpse:
-    """What of a pass leaves along the normal, and the same times its depth, mm: Fourier transforms
-    (n, p, p // 2 + 1)."""
+    """What of a pass leaves along the normal, and what `Passage.beside` tells of light beside it: Fourier
+    transforms (n, p, p // 2 + 1) and (n, 1 or 3, p, p // 2 + 1)."""
 
     spectra: NDArray[np.complex64]
-    deep: NDArray[np.complex64]
+    beside: NDArray[np.complex64]
 
     def only(self, number: int) -> Glimpse:
         """That of one source."""
-        return Glimpse(self.spectra[number : number + 1], self.deep[number : number + 1])
+        return Glimpse(self.spectra[number : number + 1], self.beside[number : number + 1])
 
 
 @dataclass(frozen=True)
@@ -78,10 +78,13 @@ class Passage:
 
     Attributes
     ----------
-    entering, leaving, seen, deep : (functions, p, p // 2 + 1)
+    entering, leaving, seen : (functions, p, p // 2 + 1)
         Fourier transforms of the kernels, over cells, padded so that nothing wraps round: of Lambertian light
         of which as much is thrown back as of what entered, and of which as much comes out; of the light
-        towards the camera, and of that times its depth.
+        towards the camera.
+    beside : (1 or 3, functions, p, p // 2 + 1)
+        Of that light times its depth, mm. Or, where scatterings favour a direction, of its change per
+        1 - cosine, and per sine of the angle in the tissue towards +x and +y, as light goes.
     shift : (p, p // 2 + 1)
         Moves the origin from the guide's first cell to the margin's.
     rings, turns
@@ -99,7 +102,7 @@ class Passage:
     entering: NDArray[np.complex64]
     leaving: NDArray[np.complex64]
     seen: NDArray[np.complex64]
-    deep: NDArray[np.complex64]
+    beside: NDArray[np.complex64]
     shift: NDArray[np.complex64]
     rings: int
     turns: int
@@ -120,7 +123,7 @@ class Passage:
             entering[number] = self._back(self.shift * _summed(spectra, self.entering))
             if glimpse:
                 found.spectra[number] = self.shift * _summed(spectra, self.seen)
-                found.deep[number] = self.shift * _summed(spectra, self.deep)
+                found.beside[number] = [self.shift * _summed(spectra, one) for one in self.beside]
         return entering, found
 
     def face(self, fraction: Array) -> Face:
@@ -159,7 +162,7 @@ class Passage:
             leaving[1:modes] += fields[1:]
             spectra = self._forth(_weighed(face.even, leaving))
             known = self._forth(_weighed(face.even[:1, :modes], fields)[0])
-            glimpse.deep[number] = _summed(spectra, self.deep[rings])
+            glimpse.beside[number] = [_summed(spectra, one[rings]) for one in self.beside]
             found = _summed(spectra, self.entering[rings]) - known
             seen = _summed(spectra, self.seen[rings])
             if self.turns:
@@ -178,41 +181,56 @@ class Passage:
         for number, fields in enumerate(light):
             spectra = self._forth(_weighed(face.even[:, : len(fields)], fields))
             glimpse.spectra[number] = _summed(spectra, self.seen[rings])
-            glimpse.deep[number] = _summed(spectra, self.deep[rings])
+            glimpse.beside[number] = [_summed(spectra, one[rings]) for one in self.beside]
         return glimpse
 
     def towards_camera(self, *glimpses: Glimpse) -> Seen:
         """What leaves towards the camera, all passes together."""
         count = len(glimpses[0].spectra)
-        maps, behind = np.empty((count, 4, *self._wide), np.float32), np.empty(count)
+        maps, mean = np.empty((count, 4, *self._wide), np.float32), np.empty(count)
         for number in range(count):
-            spectrum, deep = _all(glimpses, number)
-            behind[number] = deep[0, 0].real / max(spectrum[0, 0].real, _LEAST)
-            self._tell(maps[number], spectrum, deep - np.float32(behind[number]) * spectrum)
-        return Seen(maps, behind, 1.0 - self.transport_per_mm * behind)
+            spectrum, beside = _all(glimpses, number)
+            mean[number] = beside[0, 0, 0].real / max(spectrum[0, 0].real, _LEAST)
+            beside[0] -= np.float32(mean[number]) * spectrum
+            self._tell(maps[number], spectrum, beside)
+        return self._seen(maps, mean, 1.0)
 
     def change_towards_camera(self, glimpses: Sequence[Glimpse], changes: Sequence[Glimpse]) -> Seen:
         """Derivative of `towards_camera` where the glimpses change by so much per unit: linear in the light,
-        but for the quotient that `behind_mm` is."""
+        but for the quotient that the mean depth is, or the mean rise."""
         count = len(glimpses[0].spectra)
-        maps, behind = np.empty((count, 4, *self._wide), np.float32), np.empty(count)
+        maps, mean = np.empty((count, 4, *self._wide), np.float32), np.empty(count)
         for number in range(count):
-            (spectrum, deep), (change, deepens) = _all(glimpses, number), _all(changes, number)
+            (spectrum, beside), (change, turns) = _all(glimpses, number), _all(changes, number)
             light = max(spectrum[0, 0].real, _LEAST)
-            now = deep[0, 0].real / light
-            behind[number] = (deepens[0, 0].real - now * change[0, 0].real) / light
-            beyond = deepens - np.float32(now) * change - np.float32(behind[number]) * spectrum
-            self._tell(maps[number], change, beyond)
-        return Seen(maps, behind, -self.transport_per_mm * behind)
+            now = beside[0, 0, 0].real / light
+            mean[number] = (turns[0, 0, 0].real - now * change[0, 0].real) / light
+            turns[0] -= np.float32(now) * change + np.float32(mean[number]) * spectrum
+            self._tell(maps[number], change, turns)
+        return self._seen(maps, mean, 0.0)
 
     def _tell(
-        self, maps: NDArray[np.float32], spectrum: NDArray[np.complex64], beyond: NDArray[np.complex64]
+        self, maps: NDArray[np.float32], spectrum: NDArray[np.complex64], beside: NDArray[np.complex64]
     ) -> None:
-        """Fill in the maps of `Seen`, of light and its depth that is not the same all over."""
+        """Fill in the maps of `Seen`, of light and what is `beside`, the first less what it is all over."""
         maps[0] = self._back(spectrum)
-        deeper = self._back(beyond)
-        maps[1] = -self.transport_per_mm * deeper
-        maps[3], maps[2] = np.gradient(deeper, self.cell_mm)
+        if self._by_depth:
+            deeper = self._back(beside[0])
+            maps[1] = -self.transport_per_mm * deeper
+            maps[3], maps[2] = np.gradient(deeper, self.cell_mm)
+        else:  # rays to the camera are told by where they come from
+            maps[1], maps[2], maps[3] = self._back(beside[0]), -self._back(beside[1]), -self._back(beside[2])
+
+    def _seen(self, maps: NDArray[np.float32], mean: Array, flat: float) -> Seen:
+        """With the mean depth or the mean rise, and the rise of light that comes from the face itself."""
+        if self._by_depth:
+            return Seen(maps, mean, flat - self.transport_per_mm * mean)
+        return Seen(maps, np.zeros_like(mean), mean)
+
+    @property
+    def _by_depth(self) -> bool:
+        """Whether light beside the normal is told by how deep it comes from: with even scatterings."""
+        return len(self.beside) == 1
 
     @property
     def _wide(self) -> tuple[int, int]:
@@ -221,8 +239,9 @@ class Passage:
 
     def _nothing(self, count: int) -> tuple[Array, Glimpse]:
         """Room for so many LEDs' light."""
-        spectra, deep = np.zeros((2, count, *self.shift.shape), dtype=np.complex64)
-        return np.zeros((count, *self._wide)), Glimpse(spectra, deep)
+        spectra = np.zeros((count, *self.shift.shape), dtype=np.complex64)
+        beside = np.zeros((count, len(self.beside), *self.shift.shape), dtype=np.complex64)
+        return np.zeros((count, *self._wide)), Glimpse(spectra, beside)
 
     def _forth(self, maps: NDArray[np.floating]) -> NDArray[np.complex64]:
         padded = len(self.shift)
@@ -236,9 +255,9 @@ class Passage:
 
 
 def _all(glimpses: Sequence[Glimpse], number: int) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
-    """Spectra of one source's light, and of its depths, of all passes together."""
+    """Spectra of one source's light, and of what is beside, of all passes together."""
     spectrum = np.sum([one.spectra[number] for one in glimpses], axis=0)
-    return spectrum, np.sum([one.deep[number] for one in glimpses], axis=0)
+    return spectrum, np.sum([one.beside[number] for one in glimpses], axis=0)
 
 
 def _weighed(weights: NDArray[np.float32], fields: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -262,17 +281,21 @@ def passage(coupling: Coupling, width_mm: float, cells: int, margin: int) -> Pas
     k, azimuth = np.hypot(kx, ky[:, None]), np.arctan2(ky[:, None], kx)
     shift = np.exp(-1j * margin * step * (kx + ky[:, None])).astype(np.complex64)
     kernels: dict[int, list[NDArray[np.complex64]]] = {HELD: [], ALL: [], STEEP: [], DEEP: []}
+    beside: list[NDArray[np.complex64]] = []
     for m, transforms in enumerate(apart.transforms):
+        unit = 1j if m % 2 else 1.0
         for turn in (np.cos, np.sin) if m else (np.cos,):
             for what, tail in ((HELD, 0.0), (ALL, 0.0), (STEEP, 1.0), (DEEP, 2.0)):
-                found = apart.at(transforms[what], k, tail) * turn(m * azimuth) * (1j if m % 2 else 1.0)
+                found = apart.at(transforms[what], k, tail) * turn(m * azimuth) * unit
                 kernels[what].extend(found.astype(np.complex64))
+            if len(transforms) > RISE:
+                beside.append(_beside_normal(apart, transforms, k, azimuth, m, turn is np.sin))
     spectra = {what: np.array(one, dtype=np.complex64) for what, one in kernels.items()}
     return Passage(
         spectra[HELD],
         spectra[ALL],
         spectra[STEEP],
-        spectra[DEEP],
+        np.concatenate(beside, axis=1) if beside else spectra[DEEP][None],
         shift,
         len(apart.functions[0]),
         len(apart.functions[1]),
@@ -283,3 +306,21 @@ def passage(coupling: Coupling, width_mm: float, cells: int, margin: int) -> Pas
         transport_per_mm=apart.transport_per_mm,
         cell_mm=step,
     )
+
+
+def _beside_normal(
+    apart: Aslant, transforms: Array, k: Array, azimuth: Array, m: int, sine: bool
+) -> NDArray[np.complex64]:
+    """`Passage.beside` where scatterings favour a direction, (3, r_m, p, p // 2 + 1), of light weighed by
+    cos mφ or sin mφ: sin m(φ - φ_k) is sin mφ cos mφ_k - cos mφ sin mφ_k."""
+    unit = 1j if m % 2 else 1.0
+    along, aside = (np.sin, np.cos) if sine else (np.cos, lambda angle: -np.sin(angle))
+    rise, ahead, left = (
+        unit * apart.at(transforms[what], k, 1.0) * turn(m * azimuth)
+        for what, turn in ((RISE, along), (AHEAD, along), (LEFT, aside))
+    )
+    east, north = (
+        -1j * (ahead * first + left * second)
+        for first, second in ((np.cos(azimuth), -np.sin(azimuth)), (np.sin(azimuth), np.cos(azimuth)))
+    )
+    return np.stack([rise, east, north]).astype(np.complex64)

@@ -22,7 +22,7 @@ Anisotropy = Annotated[float, Field(ge=-0.9, le=0.99)]
 
 _SCATTERING = "Reduced scattering coefficient µs' = (1 - g) µs of the {}, 1/mm."
 _ABSORPTION = "Absorption coefficient µa of the {}, 1/mm."
-_ANISOTROPY = "Mean cosine g of one scattering; only the volumetric reference uses it."
+_ANISOTROPY = "Mean cosine g of one scattering; 0 is even, skin has about 0.9."
 
 _COLOUR = ("scattering_per_mm", "absorption_per_mm", "anisotropy")
 

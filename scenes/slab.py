@@ -52,6 +52,21 @@ class Slab:
     depth: float = np.inf
     backing: float = 0.0
 
+    @property
+    def first(self) -> float:
+        """Limit of k R^(k) at large k: light scattered once, which rises as 1/r in the middle."""
+        return 0.5 * self.albedo
+
+    @property
+    def bend(self) -> float:
+        """About the wave number at which R^ gets to that."""
+        return 1.0 + 1.0 / self.depth
+
+    @property
+    def decay_rate(self) -> float:
+        """Slowest decay λ with depth, per mean free path: that of diffuse light far from any source."""
+        return float(_modes(self.albedo)[0][0])
+
     def reflectance(self, k: Array) -> Array:
         """Fourier transform of the radial reflectance, (n,) for wave numbers (n,).
 
@@ -241,8 +256,3 @@ def _straight(k: Array, depth: float) -> Array:
     p = np.sqrt(1.0 + (q - first) * (q + first))
     inner = (1.0 - p**-2) * q / p * np.exp(-t)
     return np.asarray(np.exp(-depth * first[:, 0]) * (inner @ (half[:, None] * w).ravel()))
-
-
-def decay_rate(albedo: float) -> float:
-    """Slowest decay λ with depth, per mean free path: that of diffuse light far from any source."""
-    return float(_modes(albedo)[0][0])

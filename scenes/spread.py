@@ -14,8 +14,9 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
+from .half_space import HalfSpace
 from .radial import kernel
-from .slab import Slab, decay_rate
+from .slab import Slab
 from .tissue import Coupling, TissueOptics
 
 Array = NDArray[np.float64]
@@ -161,15 +162,14 @@ def spreader(tissue: TissueOptics, coupling: Coupling, width_mm: float, cells: i
 
 
 @lru_cache(maxsize=16)
-def _transform(body: Slab, free: float, step: float, cells: int) -> NDArray[np.float32]:
+def _transform(body: Slab | HalfSpace, free: float, step: float, cells: int) -> NDArray[np.float32]:
     """`Spread.transform` on cells so many transport lengths wide; the sensors of a layout study share it."""
 
     def under_bare_skin(k: Array) -> Array:
         reflectance = body.reflectance(k)
         return np.asarray(reflectance / (1.0 - free * reflectance))
 
-    decay = 1.0 + 1.0 / body.depth
-    shares = kernel(under_bare_skin, 0.5 * body.albedo, decay_rate(body.albedo), decay).cells(step, cells)
+    shares = kernel(under_bare_skin, body.first, body.decay_rate, body.bend).cells(step, cells)
     padded = int(scipy.fft.next_fast_len(2 * cells, real=True))
     away = np.minimum(np.arange(padded), padded - np.arange(padded))
     around = np.where(away < cells, shares[:, np.minimum(away, cells - 1)], 0.0)

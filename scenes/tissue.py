@@ -25,9 +25,10 @@ from numpy.typing import NDArray
 from .aslant import Aslant, aslant
 from .contact import ContactOptics, moment_weights
 from .ftir import gap_transmittance
+from .half_space import HalfSpace
 from .radial import Kernel, kernel
 from .skin import Skin, Tissue
-from .slab import Slab, cosines, decay_rate
+from .slab import Slab, cosines
 
 Array = NDArray[np.float64]
 
@@ -57,7 +58,7 @@ class TissueOptics:
     """
 
     transport_per_mm: float
-    slab: Slab
+    slab: Slab | HalfSpace
     kernel: Kernel
     strengths: Array
     lobes: Array
@@ -131,16 +132,23 @@ def tissue_optics(
     thickness_mm: float = np.inf,
     backing: float = 0.0,
     modes: int = MODES,
+    *,
+    anisotropy: float = 0.0,
 ) -> TissueOptics:
     """Solve the diffuse reflectance of tissue (a half-space) or of a sheet (a slab with a backing); 20 ms.
 
     `scattering_per_mm` is the reduced coefficient µs', 1/mm; `backing` the reflectance, 0..1, of what lies
     behind a sheet. Total, angles and radial profile are those of radiative transfer with isotropic scattering
-    of albedo µs'/(µs' + µa) (Chandrasekhar 1960, ch. V; key chandrasekhar1960), by `slab` and `radial`.
+    of albedo µs'/(µs' + µa) (Chandrasekhar 1960, ch. V; key chandrasekhar1960), by `slab` and `radial`; with
+    a mean cosine g of one scattering, `anisotropy`, of a half-space by `half_space` (2 s).
     """
     transport = scattering_per_mm + absorption_per_mm
-    body = Slab(scattering_per_mm / transport, thickness_mm * transport, backing)
-    curve = kernel(body.reflectance, 0.5 * body.albedo, decay_rate(body.albedo), 1.0 + 1.0 / body.depth)
+    albedo = scattering_per_mm / transport
+    body: Slab | HalfSpace = Slab(albedo, thickness_mm * transport, backing)
+    if anisotropy != 0.0:
+        assert np.isinf(thickness_mm)
+        body = HalfSpace(albedo, anisotropy)
+    curve = kernel(body.reflectance, body.first, body.decay_rate, body.bend)
     mu, weight = cosines()
     even = 2.0 * mu * weight
     grid = np.linspace(0.0, 1.0, _COSINES)
@@ -178,7 +186,10 @@ def body_behind(skin: Skin, tissue: Tissue) -> tuple[float, TissueOptics]:
     """Refractive index and optics of what the light enters: the contact sheet, or without one the tissue."""
     sheet = skin.sheet
     if sheet is None:
-        return tissue.refractive_index, tissue_optics(tissue.scattering_per_mm, tissue.absorption_per_mm)
+        optics = tissue_optics(
+            tissue.scattering_per_mm, tissue.absorption_per_mm, anisotropy=tissue.anisotropy
+        )
+        return tissue.refractive_index, optics
     optics = tissue_optics(
         sheet.scattering_per_mm, sheet.absorption_per_mm, sheet.thickness_mm, sheet.backing
     )

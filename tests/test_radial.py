@@ -5,13 +5,13 @@ import pytest
 from scipy.special import k0, k1
 
 from scenes.radial import Kernel, kernel
-from scenes.slab import Slab, decay_rate
+from scenes.slab import Slab
 
 BODIES = [Slab(0.98), Slab(0.5), Slab(0.95, 2.0), Slab(0.9, 0.3, 0.8), Slab(0.99, 0.05, 0.9)]
 
 
 def of(body: Slab) -> Kernel:
-    return kernel(body.reflectance, 0.5 * body.albedo, decay_rate(body.albedo), 1.0 + 1.0 / body.depth)
+    return kernel(body.reflectance, body.first, body.decay_rate, body.bend)
 
 
 def test_known_pairs_come_back() -> None:

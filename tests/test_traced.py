@@ -93,10 +93,15 @@ def test_an_led_that_is_dark_in_this_band_is_learned_as_dark(sensor):
 
 
 def test_a_light_that_changes_some_sensors_leaves_that_of_others(sensor):
-    """Painted walls and sheets have changed since what ships was learned, and nothing else."""
+    """Painted walls, sheets and then tissue that scatters forward have changed since what ships was learned,
+    and nothing else."""
     painted = replace(sensor, guide=replace(sensor.guide, walls="absorbing"))
     covered = replace(sensor, skin=replace(sensor.skin, sheet=Sheet(0.1, 500.0)))
-    assert traced.version(sensor) < traced.version(painted) == traced.version(covered) == traced.LIGHT
+    forward = replace(sensor, tissue=replace(sensor.tissue, anisotropy=0.9))
+    assert traced.version(sensor) < traced.version(painted) == traced.version(covered) < traced.LIGHT
+    assert traced.version(forward) == traced.LIGHT
+    hidden = replace(covered, tissue=forward.tissue)  # by the sheet
+    assert traced.version(hidden) == traced.version(covered)
 
 
 def test_a_failed_led_is_refused_before_anything_is_traced(tmp_path):

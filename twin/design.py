@@ -66,7 +66,7 @@ class Specimen:
     ] = 0.02
     anisotropy: Annotated[
         Anisotropy,
-        Field(description="Mean cosine g of one scattering; only the volumetric reference uses it."),
+        Field(description="Mean cosine g of one scattering; 0 is even, skin has about 0.9."),
     ] = 0.0
     inclusion: Annotated[
         Colour | None,
