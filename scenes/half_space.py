@@ -26,14 +26,19 @@ from .slab import Slab, cosines
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
+Directions = tuple[Array, Array]
+"""Cosines and azimuths, (p,) each."""
 
 TOP = 12.0
 """Wave number up to which harmonics tell; beyond, light scattered once does, and the rest falls as k^-2."""
 
 _ORDER, _LEVEL_ORDER = 21, 41  # in waves, and where nothing varies along the face
+_LESS = 15  # beside it, to tell what both are off: in fine waves it falls as (order + 1)^-4
 _LEAST_ABSORBED = 1e-9  # per scattering, as in `slab`
-_AZIMUTHS = 24  # per half turn
 _TILT = 0.12  # rad, about the camera's, of directions beside the normal
+_AROUND = np.cos([0.0, _TILT, _TILT, _TILT]), np.array([0.0, 0.0, np.pi, 0.5 * np.pi])
+_LEFT = np.cos([_TILT]), np.array([0.5 * np.pi])
+_HALF_TURNS = np.pi * (np.arange(24) + 0.5) / 24
 _TURNS = 128  # azimuths of a phase function's mean
 _WAVES = 36  # nodes of the reflectance
 
@@ -107,67 +112,44 @@ class HalfSpace:
         (4). (3) Of what leaves where exits at the Gauss cosines count (N,), over that of Lambertian light.
         """
         upright, across = basis(_ORDER), basis(_ORDER, across=True)
-        directions = [part.ravel() for part in np.meshgrid(cosine, azimuth, indexing="ij")]
         mu, weight = cosines()
-        half_turns = np.pi * (np.arange(_AZIMUTHS) + 0.5) / _AZIMUTHS
-        around = [part.ravel() for part in np.meshgrid(mu, half_turns, indexing="ij")]
-        weights = self._weights(upright, *directions), self._weights(across, *directions)
-        lambert_weights = self._weights(upright, *around)
-        even = np.repeat(2.0 * mu * weight, _AZIMUTHS) / _AZIMUTHS
-        shape = (len(cosine), len(azimuth))
-        found = np.empty((6, len(k), *shape), dtype=np.complex128)
+        beams, lambert = _pairs(cosine, azimuth), _pairs(mu, _HALF_TURNS)
+        even = np.repeat(2.0 * mu * weight, _HALF_TURNS.size) / _HALF_TURNS.size
+        weights, lambert_weights = self._weights(upright, *beams), self._weights(upright, *lambert)
+        across_weights = self._weights(across, *beams)
         exits = np.stack([np.ones(mu.size), counts], axis=1)
+        found = np.empty((6, len(k), beams[0].size), dtype=np.complex128)
         for number, wave in enumerate(np.asarray(k, dtype=np.float64)):
             solved = self._waves(upright, wave)
             field = solved.lit(exits)
-            fall = self._falls(wave, *directions)
-            everything, counted = solved.overlap(field, weights[0], fall) / directions[0]
-            of_all = solved.overlap(field, lambert_weights, self._falls(wave, *around)) / around[0]
-            steep, ahead, behind, aside = self._towards(
-                solved, wave, np.array([0.0, _TILT, _TILT, _TILT]), np.array([0.0, 0.0, np.pi, 0.5 * np.pi]),
-                directions, weights[0],
-            )  # fmt: skip
-            (left,) = self._towards(
-                self._waves(across, wave), wave, np.array([_TILT]), np.array([0.5 * np.pi]), directions,
-                weights[1],
-            )  # fmt: skip
-            sine, rest = np.sin(_TILT), 1.0 - np.cos(_TILT)
-            rows = (
+            fall, lambert_fall = self._falls(wave, *beams), self._falls(wave, *lambert)
+            everything, counted = solved.overlap(field, weights, fall) / beams[0]
+            of_all = solved.overlap(field, lambert_weights, lambert_fall)[1] / lambert[0]
+            steep, ahead, behind, aside = self._towards(solved, _AROUND, beams, weights)
+            (left,) = self._towards(self._waves(across, wave), _LEFT, beams, across_weights)
+            found[:, number] = (
                 everything,
                 steep,
-                0.5j * (ahead - behind) / sine,
-                counted / (of_all[1] @ even),
-                (0.25 * (ahead + behind + 2.0 * aside) - steep) / rest,
-                1j * left / sine,
+                0.5j * (ahead - behind) / np.sin(_TILT),
+                counted / (of_all @ even),
+                (0.25 * (ahead + behind + 2.0 * aside) - steep) / (1.0 - np.cos(_TILT)),
+                1j * left / np.sin(_TILT),
             )
-            found[:, number] = np.stack(rows).reshape(6, *shape)
-        return found
+        return found.reshape(6, len(k), len(cosine), len(azimuth))
 
-    def _towards(
-        self,
-        solved: Waves,
-        wave: float,
-        tilt: Array,
-        turn: Array,
-        directions: list[Array],
-        weights: Complex,
-    ) -> Complex:
-        """Radiance factor π L / E out in directions so far from the normal, of beams: (ways, p)."""
-        cosine, azimuth = directions
-        out, sine = np.cos(tilt), np.sin(tilt)
-        falls = self._falls(wave, out, turn)
-        fall = self._falls(wave, cosine, azimuth)
-        field = solved.beams(self._sources(solved.basis), falls, out, turn)
-        several = solved.overlap(field, weights, fall)
-
-        def once(side: float) -> Array:
-            turned = np.cos(azimuth - side * turn[:, None])
-            level = -out[:, None] * cosine + sine[:, None] * np.sqrt(1.0 - cosine**2) * turned
-            return self._phase(level)
-
-        phase = 0.5 * (once(1.0) + (-1.0 if solved.basis.across else 1.0) * once(-1.0))
-        several += self._scattering * phase / (fall + falls[:, None])
-        return np.asarray(np.pi * several / (cosine * out[:, None]))
+    def _towards(self, solved: Waves, exits: Directions, beams: Directions, weights: Complex) -> Complex:
+        """Radiance factor π L / E out at the cosines and azimuths of exits, of beams: (exits, p); what of it
+        is even about the wave, or odd."""
+        (out, turn), (cosine, azimuth) = exits, beams
+        falls, fall = self._falls(solved.wave, *exits), self._falls(solved.wave, *beams)
+        several = solved.overlap(solved.beams(self._sources(solved.basis), falls, *exits), weights, fall)
+        level, sines = -out[:, None] * cosine, np.sqrt((1.0 - out[:, None] ** 2) * (1.0 - cosine**2))
+        one, other = (
+            self._phase(level + sines * np.cos(azimuth - side * turn[:, None])) for side in (1.0, -1.0)
+        )
+        phase = 0.5 * (one - other if solved.basis.across else one + other)
+        once = self._scattering * phase / (fall + falls[:, None])
+        return np.asarray(np.pi * (several + once) / (cosine * out[:, None]))
 
     @property
     def _scattering(self) -> float:
@@ -184,10 +166,10 @@ class HalfSpace:
         ahead = self._scattering * (1.0 - self.anisotropy ** (order + 1))
         return max(1.0 - self.albedo, _LEAST_ABSORBED) + ahead
 
-    def _falls(self, wave: float, cosine: Array, azimuth: Array) -> Complex:
+    def _falls(self, wave: float, cosine: Array, azimuth: Array, order: int = _ORDER) -> Complex:
         """p = µ*/µ + i k tanθ cosφ of beams."""
         ahead = np.sqrt(np.maximum(1.0 - cosine**2, 0.0)) / cosine * np.cos(azimuth)
-        return np.asarray(self._fall(_ORDER) / cosine + 1j * wave * ahead)
+        return np.asarray(self._fall(order) / cosine + 1j * wave * ahead)
 
     def _sources(self, harmonics: Basis) -> Array:
         """What harmonics scatter, (n,)."""
@@ -219,18 +201,22 @@ def _ratio(body: HalfSpace) -> CubicSpline:
     """Reflectance over that of even scatterings, on asinh(k / 0.05); 1 s."""
     nodes = np.concatenate([[0.0], np.geomspace(0.02, TOP, _WAVES)])
     mu, weight = cosines()
-    half_turns = np.pi * (np.arange(_AZIMUTHS) + 0.5) / _AZIMUTHS
-    around = [part.ravel() for part in np.meshgrid(mu, half_turns, indexing="ij")]
-    even = np.repeat(2.0 * weight, _AZIMUTHS) / _AZIMUTHS
-    harmonics = basis(_ORDER)
-    weights = body._weights(harmonics, *around)
-    found = []
-    for wave in nodes:
-        solved = body._waves(harmonics, wave)
-        field = solved.lit(np.ones((mu.size, 1)))
-        found.append((solved.overlap(field, weights, body._falls(wave, *around))[0] @ even).real)
+    lambert = _pairs(mu, _HALF_TURNS)
+    even = np.repeat(2.0 * weight, _HALF_TURNS.size) / _HALF_TURNS.size
+
+    def by(order: int) -> Array:
+        harmonics, found = basis(order), []
+        weights = body._weights(harmonics, *lambert)
+        for wave in nodes:
+            solved = body._waves(harmonics, wave)
+            field, fall = solved.lit(np.ones((mu.size, 1))), body._falls(wave, *lambert, order)
+            found.append((solved.overlap(field, weights, fall)[0] @ even).real)
+        return np.array(found)
+
+    rest = ((_LESS + 1) / (_ORDER + 1)) ** 4
+    found = (by(_ORDER) - rest * by(_LESS)) / (1.0 - rest)
     exact = body.plane_albedo(mu) @ (2.0 * mu * weight)
-    shares = np.array(found) * exact / found[0] / Slab(body.albedo).reflectance(nodes)
+    shares = found * exact / found[0] / Slab(body.albedo).reflectance(nodes)
     return CubicSpline(np.arcsinh(nodes / 0.05), shares)
 
 
@@ -249,6 +235,12 @@ def _single(anisotropy: float) -> tuple[Array, Array]:
     phase = _phase((2.0 - reach**2 - eta**2) / apart, anisotropy)
     rings = (reach**2 - 1.0) * (1.0 - eta**2) / apart**2 * phase @ (2.0 * weight)
     return reach[:, 0], np.asarray(rings * weight * reach[:, 0] ** 2)
+
+
+def _pairs(cosine: Array, azimuth: Array) -> Directions:
+    """Every cosine with every azimuth."""
+    one, other = np.meshgrid(cosine, azimuth, indexing="ij")
+    return one.ravel(), other.ravel()
 
 
 def _complex(values: Array) -> Complex:
