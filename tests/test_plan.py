@@ -12,7 +12,7 @@ import pytest
 
 import fem
 from fem.sampling import Ranges
-from twin import cli, probe
+from twin import cli, index, probe, sample
 from twin.complaint import DesignError
 from twin.design import load_design
 from twin.plan import freeze, load_plan
@@ -102,6 +102,26 @@ def test_the_digest_is_of_all_that_decides_the_pictures(tmp_path):
     )
     assert one.head.samples.sha256 == rough.head.samples.sha256
     assert one.digest == again.digest != rough.digest
+
+
+def test_more_light_paths_make_less_noise_of_the_same_samples(tmp_path, variant):
+    """Sixteen times as many take noise to a quarter; the plan of a study that says nothing is as it was."""
+    plain = frozen(tmp_path, name="plain", light="preview", count=1)
+    assert plain.head.paths is None and '"paths"' not in (tmp_path / "plain" / "plan.json").read_text()
+    few, many = (
+        frozen(tmp_path, name=str(paths), quality="preview", light="preview", count=1, paths=paths)
+        for paths in (2**14, 2**18)
+    )
+    assert few.head.samples.sha256 == many.head.samples.sha256 and few.digest != many.digest
+    noise = []
+    for plan in (few, many):
+        sample.make(plan, 0, plan.folder)
+        index.build(plan.folder, plan, plan.digest)
+        noise.append(pd.read_parquet(plan.folder / "index.parquet")["noise_percent"].mean())
+    print(noise)
+    assert 2.5 < noise[0] / noise[1] < 6.0
+    with pytest.raises(DesignError, match="paths: received 3; allowed an integer from 1024"):
+        frozen(tmp_path, name="none", paths=3)
 
 
 @pytest.mark.parametrize("sampler", ["uniform", "sobol", "latin"])

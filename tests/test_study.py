@@ -89,6 +89,7 @@ BAD = {
         STUDY.replace("name =", 'quality = "best"\nname =', 1),
         ["quality", "'best'", "preview"],
     ),
+    "a few paths": (STUDY.replace("name =", "paths = 12\nname =", 1), ["paths", "12", ">= 1024"]),
     "a negative seed": (STUDY.replace("name =", "seed = -1\nname =", 1), ["seed", "-1", ">= 0"]),
     "an emulator for nothing": (STUDY.replace("name =", 'emulator = "a.npz"\nname =', 1), ["emulator"]),
     "unknown distribution": (

@@ -77,6 +77,7 @@ def text(corpus: Corpus) -> str:
         "On disk": f"{'' if exact else 'about '}{_human(size)}, {_human(size / corpus.frames)} a frame",
         "Sensor": f"{_plain(design.name)}: {_plain(design.description)}",
         "Mechanics": f"{plan.mechanics}, quality {plan.quality}; light: quality {plan.light}, "
+        f"{'' if plan.head.paths is None else f'{plan.head.paths} paths from each LED, '}"
         f"{'one seed for all' if plan.light_seed == 'shared' else 'a seed for each sample'}",
         "Seed": str(plan.seed),
         "Versions": ", ".join(

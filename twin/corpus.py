@@ -63,7 +63,7 @@ class Corpus:
         if not self.path.is_dir():
             raise DesignError("corpus", shown(str(path)), "the folder of a corpus")
         self.plan = plan = load_plan(self.path)
-        self.name, self.description, self.design = plan.name, plan.description, plan.base
+        self.name, self.description, self.design = plan.name, plan.head.description, plan.base
         self.indentation_mm = plan.indentation_mm
         self.arrow: pyarrow.Table = read_index(self.path, plan)
         self.samples: NDArray[np.int64] = self.arrow["sample"].to_numpy()[:: self.levels]

@@ -114,6 +114,12 @@ def _add_plan(actions: Any) -> None:
     for flag, of in (("--quality", "the mechanics"), ("--light", "the light")):
         words = f"{', '.join(QUALITIES)}: of {of} (default: the study's)"
         plan.add_argument(flag, type=choice(*QUALITIES), metavar="Q", help=words)
+    plan.add_argument(
+        "--paths",
+        type=whole,
+        metavar="N",
+        help="light paths from each LED; four times as many halve their noise (default: the quality's)",
+    )
     plan.add_argument("--count", type=whole, metavar="N", help="only the first N samples of every group")
     plan.add_argument("--no-probe", action="store_true", help="simulate nothing, estimate nothing")
     plan.add_argument(

@@ -33,6 +33,7 @@ def _plan(arguments: argparse.Namespace) -> int:
             traced=arguments.traced,
             quality=arguments.quality,
             light=arguments.light,
+            paths=arguments.paths,
             count=arguments.count,
             progress=report,
         )

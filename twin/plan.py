@@ -59,6 +59,7 @@ def freeze(
     traced: str | Path | None = None,
     quality: presses.Quality | None = None,
     light: presses.Quality | None = None,
+    paths: int | None = None,
     count: int | None = None,
     progress: Progress | None = None,
 ) -> Plan:
@@ -76,6 +77,9 @@ def freeze(
     settings = source.study
     if count is not None and count < 1:
         raise DesignError("count", shown(count), "an integer > 0")
+    if paths is not None and not 2**10 <= paths <= 2**32:
+        raise DesignError("paths", shown(paths), f"an integer from {2**10} to {2**32}")
+    paths = paths or settings.paths
     design = _design(source)
     try:
         colourless(design, "a corpus")
@@ -92,6 +96,8 @@ def freeze(
         if mechanics != "emulator":
             design = design.pressed(mechanics=mechanics)
         lit = light or settings.light or quality or settings.quality
+        if light_file is not None and paths is not None:
+            raise DesignError("paths", f"{paths} with learned light", "it with light that follows paths")
         if light_file is not None and lit == "reference":
             raise DesignError(
                 "traced", "it with light = 'reference'", "it with 'preview' or 'standard' light"
@@ -135,6 +141,7 @@ def freeze(
             "mechanics": mechanics,
             "indentation_mm": list(settings.indentation_mm),
             "light_seed": settings.light_seed,
+            **({} if paths is None else {"paths": paths}),
             "randomise": {key: _said(value) for key, value in settings.randomise.items()},
             "samples": {"file": SAMPLES, "count": len(columns["sample"]), "sha256": sha256(folder / SAMPLES)},
             "groups": planned,

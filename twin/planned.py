@@ -33,6 +33,7 @@ from twin.study import (
     GroupName,
     LightSeed,
     Name,
+    Paths,
     Randomise,
     Sampler,
     Seed,
@@ -108,6 +109,7 @@ class Head:
     study: Annotated[str, Field(max_length=MAX_TEXT)]
     ies: Annotated[dict[str, Sha], Field(max_length=64)] = Field(default_factory=dict)
     traced: TracedFile | None = None
+    paths: Paths | None = None
 
 
 _HEAD = TypeAdapter(Head)
@@ -135,10 +137,6 @@ class Plan:
     @property
     def name(self) -> str:
         return self.head.name
-
-    @property
-    def description(self) -> str:
-        return self.head.description
 
     @property
     def seed(self) -> int:

@@ -202,6 +202,8 @@ def _key(plan: Plan, contact: Contact, light: int) -> str:
     head = plan.head  # its design, not that of the sample, which knows where the corpus lies
     told.update(repr((head.design_sha256, sorted(head.ies.items()))).encode())
     told.update(repr((plan.light, light, contact.level_mm, LIGHT, SIGHT)).encode())
+    if plan.head.paths is not None:
+        told.update(repr(plan.head.paths).encode())
     if head.traced is not None:
         told.update(head.traced.sha256.encode())
     for array in (contact.surface.points, contact.surface["pressure_0"], contact.surface["displacement_0"]):
@@ -229,7 +231,12 @@ def _render(plan: Plan, design: Design, contact: Contact, field: str, seed: int)
     renderer = _renderer(design)
     traced = None if plan.traced is None else _traced(str(plan.traced))
     return renderer.render(
-        contact.surface, field=field, quality=plan.light, seed=light_seed(seed), traced=traced
+        contact.surface,
+        field=field,
+        quality=plan.light,
+        seed=light_seed(seed),
+        samples=plan.head.paths,
+        traced=traced,
     )
 
 

@@ -30,6 +30,8 @@ PARAMETERS = ("size_mm", "depth_mm", "modulus_kPa", "offset_x_mm", "offset_y_mm"
 Sampler = Literal["uniform", "latin", "sobol", "grid", "table"]
 CorpusMechanics = Literal["finite", "linear", "emulator"]
 LightSeed = Literal["shared", "own"]
+Paths = Annotated[int, Field(ge=2**10, le=2**32)]
+"""Light paths from each LED."""
 Name = Annotated[str, Field(min_length=1, max_length=100, pattern=r"^[^\x00-\x1f\x7f-\x9f]*$")]
 GroupName = Annotated[str, Field(min_length=1, max_length=100, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
 """Fit to be a file's name, which readers and exporters may make of it."""
@@ -116,6 +118,7 @@ class Study:
     seed: Seed = 0
     quality: Quality = "standard"
     light: Quality | None = None
+    paths: Paths | None = None
     mechanics: CorpusMechanics | None = None
     emulator: FileName | None = None
     traced: FileName | None = None
