@@ -33,8 +33,8 @@ Array = NDArray[np.float64]
 CELLS = 100  # of the irradiance grid, per side
 SINKS = ("tissue", "guide", "glass", "walls", "frame", "leds", "below", "aside", "housing")
 """Where light ends: enters the tissue; absorbed in guide, glass, by painted walls, the glass's black frame,
-LEDs' bodies; leaves downwards, for a black housing; leaves through the sides, or never went in; absorbed by a
-housing that reflects."""
+LEDs' bodies in guide and glass; leaves downwards, for a black housing; leaves through the sides, whatever it
+meets there, or never went in; absorbed by a housing that reflects."""
 
 # Deposits are summed as integers: the sum does not depend on the order of threads
 _FIXED_POINT = float(2**20)
@@ -42,7 +42,7 @@ MAX_BOUNCES = 512
 # Legs of the two families of paths that `direct` gathers, and any other
 IN_AIR, IN_GUIDE, _DOWN, _IN_GLASS_UP, _BACK_UP, OTHER = range(6)
 _SURE_BOUNCES, _GO_ON = 12, 0.99  # before Russian roulette, and the chance to go on after them
-_WORTHWHILE = 0.02  # what a path still carries; of those with less some go on, with as much
+_WORTHWHILE, _ENOUGH = 0.02, 0.1  # what a path still carries; of those with less some go on, with as much
 
 
 @dataclass(frozen=True)
@@ -161,9 +161,14 @@ def walk(
             tally.add(number, met.p, throughput, elsewhere & on_housing)
         sample1, sample2 = random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32())
         direction, share = bounce_off(sensor, faces, met, elsewhere, sample1, sample2)
-        direction = dr.select(on_contact, met.mirrored, direction)
+        lost = elsewhere & leaves(sensor, met)  # what is mirrored goes on as weight: no chance, no noise
+        direction = dr.select(on_contact | lost, met.mirrored, direction)
+        share = dr.select(lost, faces.reflectance(met), share)
         kept = dr.select(on_contact, throughput - entering, throughput * share)
-        stopped = dr.select(elsewhere, throughput - kept, 0.0)
+        stopped = dr.select(elsewhere & ~lost, throughput - kept, 0.0)
+        gone_out, downwards = dr.select(lost, throughput - kept, 0.0), met.kind == TO_AIR
+        sink["below"] += dr.select(downwards, gone_out, 0.0)
+        sink["aside"] += dr.select(downwards, 0.0, gone_out)
         on_led, on_wall = met.kind == LED, met.kind == WALL
         sink["leds"] += dr.select(on_led, stopped, 0.0)
         sink["walls"] += dr.select(on_wall, stopped, 0.0)
@@ -172,7 +177,7 @@ def walk(
         passed = elsewhere & (cosine * dr.dot(direction, met.normal) < 0.0)
         leg = next_leg(leg, met.kind, passed, by_own_window(sensor, number, met))
 
-        survive = chance(kept, bounce)
+        survive = chance(kept, bounce, _ENOUGH)
         alive = alive & (kept > 0.0) & (random.next_float32() < survive) & (bounce < MAX_BOUNCES)
         throughput = dr.select(alive, kept / survive, 0.0)
         rest = (*sink.values(), *scores)
@@ -331,12 +336,12 @@ def absorb(sensor: Sensor, ray: mi.Ray3f, met: Meeting, throughput: mi.Float) ->
     }
 
 
-def chance(kept: mi.Float, bounce: mi.UInt32) -> mi.Float:
+def chance(kept: mi.Float, bounce: mi.UInt32, worthwhile: float = _WORTHWHILE) -> mi.Float:
     """With what chance a path goes on, its weight divided by it, that carries so much.
 
     Few paths end that carry much: others would carry more than all, and be the picture's noise.
     """
-    return dr.minimum(kept / _WORTHWHILE, dr.select(bounce < _SURE_BOUNCES, 1.0, _GO_ON))
+    return dr.minimum(kept / worthwhile, dr.select(bounce < _SURE_BOUNCES, 1.0, _GO_ON))
 
 
 def bounce_off(

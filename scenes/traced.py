@@ -35,14 +35,14 @@ _COARSE = 50  # cells per side on which modes are kept
 _FINE = 100  # on which their mean is
 _BEYOND = 2.0  # how far inputs may leave what was learned, times its reach
 FORMAT = "tsis-traced-3"
-LIGHT = 10
+LIGHT = 11
 """Counts up when pictures of the same press change: what was learned or kept before is of no use then.
 9: windows of other LEDs in painted walls, thin sheets that hardly scatter; 10: tissue whose scatterings
-favour a direction (see `version`)."""
+favour a direction (see `version`); 11: half the noise, so that pictures and references go together."""
 BIAS_SINCE = 5
 """The first light of which a quality's measured bias holds: what changed since is common to all qualities, or
 less than the bias is known to (LIGHT 7, 8: 0.11 % in a blob, 0.09 % in a background), or touches no measured
-design (9, 10)."""
+design (9, 10), or is noise (11)."""
 ARRAYS = ("centre", "axes", "nodes", "weights", "mean", "modes")
 """Fields of `TracedLight` that are arrays."""
 
@@ -111,8 +111,8 @@ class TracedLight:
 
 
 def version(sensor: Sensor) -> int:
-    """Return the last `LIGHT` that changed a sensor's pictures; 9 changed none of polished walls without a
-    sheet, 10 none of tissue that scatters evenly, as the light that ships is of."""
+    """Return the last `LIGHT` that changed a sensor's pictures beyond their noise; 9 changed none of polished
+    walls without a sheet, 10 none of tissue that scatters evenly, as the light that ships is of."""
     if sensor.skin.sheet is None and sensor.tissue.anisotropy != 0.0:
         return 10
     return 8 if sensor.guide.walls == "polished" and sensor.skin.sheet is None else 9
