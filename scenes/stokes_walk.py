@@ -1,8 +1,8 @@
 """Polarised and unpolarised light followed through the sensor on the same paths.
 
 The walk is that of `trace`, none of it gathered. At a polished face chance takes Fresnel's mean of s and p,
-and the Stokes vector the face's Mueller matrix over it; at the contact both lose what enters the tissue.
-Painted walls and tissue depolarise.
+and the Stokes vector the face's Mueller matrix over it; both lose what passes where it never comes back, and
+at the contact what enters the tissue. Painted walls and tissue depolarise.
 
 Import only after a variant is set (`scenes.backend.use` or `use_polarised`).
 """
@@ -21,7 +21,7 @@ from .bsdf import Table
 from .faces import CONTACT, LED, NOTHING, TO_AIR, TO_GLASS, WALL, Faces
 from .irradiance import AngularBasis
 from .sensor import Sensor
-from .trace import CELLS, MAX_BOUNCES, SINKS, absorb, bounce_off, chance
+from .trace import CELLS, ENOUGH, MAX_BOUNCES, SINKS, absorb, bounce_off, chance, leaves
 from .windows import painted
 
 Array = NDArray[np.float64]
@@ -127,7 +127,9 @@ def walk(
         elsewhere = alive & ~on_contact
         sample1, sample2 = random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32())
         direction, share = bounce_off(sensor, faces, met, elsewhere, sample1, sample2)
-        direction = dr.select(on_contact, met.mirrored, direction)
+        lost = elsewhere & leaves(sensor, met)
+        direction = dr.select(on_contact | lost, met.mirrored, direction)
+        share = dr.select(lost, faces.reflectance(met), share)
         kept = throughput * dr.select(on_contact, 1.0 - through, share)
         clear = elsewhere & ((met.kind == TO_GLASS) | (met.kind == TO_AIR) | (met.kind == WALL))
         if sensor.guide.walls != "polished":
@@ -135,7 +137,8 @@ def walk(
         mirrored, passing = stokes.fresnel(cosine, faces.eta(met))
         passed = cosine * dr.dot(direction, met.normal) < 0.0
         chosen = dr.select(passed, passing.acts(light), mirrored.acts(light))
-        chosen *= dr.rcp(dr.maximum(dr.select(passed, passing.a, mirrored.a), 1e-12))
+        taken = dr.rcp(dr.maximum(dr.select(passed, passing.a, mirrored.a), 1e-12))
+        chosen *= dr.select(lost, 1.0, taken)
         after = dr.select(clear, chosen, stokes.unpolarised(share * light.x))
         after = dr.select(on_contact, mirror.acts(light), after)
 
@@ -145,7 +148,9 @@ def walk(
             ("frame", (met.kind != LED) & (met.kind != WALL)),
         ):
             end(name, elsewhere & ~clear & where, throughput - kept, light.x - after.x)
-        survive = chance(kept, bounce)
+        for name, where in (("below", met.kind == TO_AIR), ("aside", met.kind == WALL)):
+            end(name, lost & where, throughput - kept, light.x - after.x)
+        survive = chance(kept, bounce, ENOUGH)
         alive = alive & (kept > 0.0) & (random.next_float32() < survive) & (bounce < MAX_BOUNCES)
         throughput, light = dr.select(alive, kept / survive, 0.0), dr.select(alive, after / survive, 0.0)
         return met.leaving(direction), throughput, light, side, bounce + 1, alive, random, *sinks

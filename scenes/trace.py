@@ -42,7 +42,7 @@ MAX_BOUNCES = 512
 # Legs of the two families of paths that `direct` gathers, and any other
 IN_AIR, IN_GUIDE, _DOWN, _IN_GLASS_UP, _BACK_UP, OTHER = range(6)
 _SURE_BOUNCES, _GO_ON = 12, 0.99  # before Russian roulette, and the chance to go on after them
-_WORTHWHILE, _ENOUGH = 0.02, 0.1  # what a path still carries; of those with less some go on, with as much
+_WORTHWHILE, ENOUGH = 0.02, 0.1  # what a path still carries; of those with less some go on, with as much
 
 
 @dataclass(frozen=True)
@@ -177,7 +177,7 @@ def walk(
         passed = elsewhere & (cosine * dr.dot(direction, met.normal) < 0.0)
         leg = next_leg(leg, met.kind, passed, by_own_window(sensor, number, met))
 
-        survive = chance(kept, bounce, _ENOUGH)
+        survive = chance(kept, bounce, ENOUGH)
         alive = alive & (kept > 0.0) & (random.next_float32() < survive) & (bounce < MAX_BOUNCES)
         throughput = dr.select(alive, kept / survive, 0.0)
         rest = (*sink.values(), *scores)

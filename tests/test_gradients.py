@@ -139,7 +139,7 @@ def hold_choices(monkeypatch):
         return dr.maximum(cosine, 1e-4) * dr.inv_pi
 
     monkeypatch.setattr(trace, "_SURE_BOUNCES", 10_000)
-    monkeypatch.setattr(trace, "_ENOUGH", 1e-30)
+    monkeypatch.setattr(trace, "ENOUGH", 1e-30)
     monkeypatch.setattr(Table, "draw", draw)
     monkeypatch.setattr(Table, "density", density)
 
@@ -274,7 +274,7 @@ def test_walks_are_scored(variant, name, monkeypatch):
     from scenes.answers import Answers
 
     monkeypatch.setattr(trace, "_SURE_BOUNCES", 10_000)
-    monkeypatch.setattr(trace, "_ENOUGH", 1e-30)
+    monkeypatch.setattr(trace, "ENOUGH", 1e-30)
     renderer, _, slope = stage(name)
     answers = Answers.of(WIDTH, slope[None], [None])
     each = 2**12
