@@ -80,8 +80,10 @@ class HalfSpace:
         """Fourier transform of the radial reflectance, as `Slab.reflectance`, (n,) for wave numbers (n,)."""
         wave = np.atleast_1d(np.asarray(k, dtype=np.float64))
         inner = np.minimum(wave, TOP)
-        within = _ratio(self)(np.arcsinh(inner / 0.05)) * Slab(self.albedo).reflectance(inner)
-        beyond = self._once(wave) + (within - self._once(inner)) * (inner / np.maximum(wave, TOP)) ** 2
+        told = _ratio(self)(np.arcsinh(inner / 0.05)) * Slab(self.albedo).reflectance(inner)
+        once = self._once(inner)
+        within = np.maximum(told, once)  # of tissue that is nearly black the harmonics know less than that
+        beyond = self._once(wave) + (within - once) * (inner / np.maximum(wave, TOP)) ** 2
         return np.where(wave > TOP, beyond, within)
 
     def factors(self, cosine: Array) -> Array:

@@ -288,7 +288,7 @@ def passage(coupling: Coupling, width_mm: float, cells: int, margin: int) -> Pas
             for what, tail in ((HELD, 0.0), (ALL, 0.0), (STEEP, 1.0), (DEEP, 2.0)):
                 found = apart.at(transforms[what], k, tail) * turn(m * azimuth) * unit
                 kernels[what].extend(found.astype(np.complex64))
-            if len(transforms) > RISE:
+            if len(transforms) > RISE:  # scatterings favour a direction
                 beside.append(_beside_normal(apart, transforms, k, azimuth, m, turn is np.sin))
     spectra = {what: np.array(one, dtype=np.complex64) for what, one in kernels.items()}
     return Passage(
