@@ -27,8 +27,13 @@ Pair = tuple[Regression, Regression]
 Known = tuple[tuple[Floats, Floats], ...]  # lengths and noise of both regressions
 
 _FOLDS = 10
-_FEWEST = {"sample": 30, "pair": 12, "stretch": 10}  # that a fit makes sense with
-_NAMES = {"sample": "samples", "pair": "pairs of meshes", "stretch": "samples at finite strain"}
+_FEWEST = {"sample": 30, "pair": 12, "stretch": 10, "stretched_pair": 12}  # that a fit makes sense with
+_NAMES = {
+    "sample": "samples",
+    "pair": "pairs of meshes",
+    "stretch": "samples at finite strain",
+    "stretched_pair": "pairs of meshes at finite strain",
+}
 _LEAST = 12  # samples at finite strain that the learning curve begins with
 _HELD = 3  # one in so many of the samples with both offsets is what the learning curve is measured on
 _IMAGES = 0.5  # how far beyond the symmetry planes images of the samples are learned, in largest offsets
@@ -123,11 +128,13 @@ class _Samples:
 
 @dataclass(frozen=True)
 class _Known:
-    """All that a fit is made from; `more` is what finite strain adds."""
+    """All that a fit is made from; `more` is what finite strain adds, `pairs` and `pairs_more` what a finer
+    mesh adds to either."""
 
     samples: _Samples
     pairs: _Samples
     more: _Samples | None
+    pairs_more: _Samples | None
     base: _Background
 
     def without(self, held: Callable[[NDArray[np.int64]], NDArray[np.bool_]]) -> _Known:
@@ -168,26 +175,33 @@ def fit(plan: Plan, folder: str | Path, samples: int | None = None) -> Emulator:
     kinds = [("sample", samples), ("pair", None)]
     if plan.finite:
         kinds.append(("stretch", None if samples is None else -(-samples // STRETCHED)))
+        kinds.append(("stretched_pair", None))
     read = [_read(plan, place, *kind) for kind in kinds]
-    known = _Known(read[0], read[1], read[2] if plan.finite else None, _read_background(place))
-    solves = np.zeros((3, 2))
+    more, pairs_more = read[2:] if plan.finite else (None, None)
+    known = _Known(read[0], read[1], more, pairs_more, _read_background(place))
+    solves = np.zeros((4, 2))
     solves[: len(kinds)] = [tally(place, *kind) for kind in kinds]
     with one_thread():
         fits = _fit(known, None)
-        finer = regress(known.pairs.inputs[:, CENTRED], _flat(known.pairs.rise))
-        errors = _cross_validated(known, fits, finer, solves)
+        gains = [_finer(pairs) for pairs in (known.pairs, known.pairs_more) if pairs is not None]
+        errors = _cross_validated(known, fits, gains, solves)
     base = known.base
     rise, tared = fits.samples
     rise_more, tared_more = (None, None) if fits.more is None else fits.more
-    return Emulator(
-        plan, base.x, base.pressure, base.moved, rise, tared, finer, rise_more, tared_more, errors
-    )
+    finer, finer_more = gains[0], gains[1] if plan.finite else None
+    parts = rise, tared, finer, rise_more, tared_more, finer_more
+    return Emulator(plan, base.x, base.pressure, base.moved, *parts, errors)
 
 
-def _cross_validated(known: _Known, fits: _Fits, finer: Regression, solves: Floats) -> Errors:
+def _finer(pairs: _Samples, known: Regression | None = None) -> Regression:
+    """What a finer mesh adds; with lengths and noise of another regression, or None to find them."""
+    inputs = pairs.inputs[:, [k for k in CENTRED if k < pairs.inputs.shape[1]]]
+    return regress(inputs, _flat(pairs.rise), None if known is None else (known.lengths, known.noise))
+
+
+def _cross_validated(known: _Known, fits: _Fits, gains: list[Regression], solves: Floats) -> Errors:
     """Errors of samples that are left out, some at a time, from fits with the same lengths."""
-    last, pairs = known.last, known.pairs
-    found, gain = np.empty((len(last.points), 6)), np.empty((len(pairs.points), 3))
+    last, found = known.last, np.empty((len(known.last.points), 6))
     for k in range(_FOLDS):
 
         def held(number: NDArray[np.int64], k: int = k) -> NDArray[np.bool_]:
@@ -195,19 +209,34 @@ def _cross_validated(known: _Known, fits: _Fits, finer: Regression, solves: Floa
 
         fold = held(last.number)
         found[fold] = _errors(known, _fit(known.without(held), fits.lengths), last.number[fold])
-        fold = held(pairs.number)
-        rest = pairs.part(~fold)
-        again = regress(rest.inputs[:, CENTRED], _flat(rest.rise), (finer.lengths, finer.noise))
-        for i in map(int, np.flatnonzero(fold)):
-            guess = again(pairs.inputs[i : i + 1, CENTRED]).reshape(pairs.rise[i].shape)
-            whole = fits.samples[0](pairs.inputs[i : i + 1]).reshape(guess.shape)
-            unit = known.base.unit(pairs.plan, pairs.points[i])[0]
-            miss, true = (
-                unit * pairs.on_grid(i, "rise", f, known.base.x) for f in (guess - pairs.rise[i], whole)
-            )
-            gain[i] = _missed(miss, true, known.base.x)
     inside = last.typical & np.isfinite(found).all(axis=1)
-    return Errors(last.points[inside, 0], found[inside, :3], found[inside, 3:], gain, _curve(known), solves)
+    finer = _finer_errors(known, fits, known.pairs, gains[0])
+    more = np.empty((0, 3))
+    if known.pairs_more is not None:
+        more = _finer_errors(known, fits, known.pairs_more, gains[1])
+    fields = found[inside, :3], found[inside, 3:], finer, more
+    return Errors(last.points[inside, 0], *fields, _curve(known), solves)
+
+
+def _finer_errors(known: _Known, fits: _Fits, pairs: _Samples, gain: Regression) -> Floats:
+    """Errors (n, 3) of what a finer mesh adds, of each pair left out, over the tared pressure at small
+    strain, as `_missed`."""
+    plan, x, found = known.samples.plan, known.base.x, np.empty((len(pairs.points), 3))
+    for i in range(len(pairs.points)):
+        fold = np.arange(len(pairs.points)) == i
+        guess = _finer(pairs.part(~fold), gain)(gain.inputs[i : i + 1]).reshape(pairs.rise[i].shape)
+        miss = pairs.on_grid(i, "rise", guess - pairs.rise[i], x)
+        n = known.samples.rise.shape[-1]
+        whole = fits.samples[0](features(plan, pairs.points[i : i + 1])[:, :-1]).reshape(-1, n, n)
+        unit = known.base.unit(plan, pairs.points[i])
+        if pairs is known.pairs_more:
+            along = lagrange(contrast(plan.ratios), float(pairs.points[i, 6]))
+            whole, unit = np.tensordot(along, whole, 1)[None], unit[1:]
+        else:
+            unit = unit[:1]
+        true = replace(pairs, res=plan.resolution).on_grid(i, "rise", whole, x)
+        found[i] = _missed(miss * unit, true * unit, x)
+    return found
 
 
 def _read(plan: Plan, folder: Path, kind: str, first: int | None) -> _Samples:
@@ -217,9 +246,10 @@ def _read(plan: Plan, folder: Path, kind: str, first: int | None) -> _Samples:
         what = f"{len(found)} {_NAMES[kind]} that were solved"
         raise NotBuilt(f"samples: received {what}; allowed {_FEWEST[kind]} and more")
     points = np.stack([f["point"] for f in found])
-    if kind == "pair":
+    finite, paired = kind.startswith("stretch"), kind.endswith("pair")
+    if paired:
         points[:, 2:4] = 0.0
-    s = points[:, 6:] if kind == "stretch" else contrast(plan.ratios)
+    s = points[:, 6:] if finite else contrast(plan.ratios)
     scales = amplitudes(points[:, None], s)  # each (n, cases or 1)
     none = np.zeros((*found[0]["rise"].shape, 0))  # pairs have no displacements
     rise = np.stack([f["rise"] for f in found]) / scales[0][..., None, None]
@@ -227,9 +257,9 @@ def _read(plan: Plan, folder: Path, kind: str, first: int | None) -> _Samples:
     seconds = np.array([float(f["seconds"]) for f in found])
     number = np.array([int(f["number"]) for f in found])
     inputs = features(plan, points)
-    if kind != "stretch":
+    if not finite:
         inputs = inputs[:, :-1]
-    res = plan.coarse if kind == "stretch" else plan.resolution
+    res = plan.fine if paired else plan.coarse if finite else plan.resolution
     return _Samples(plan, res, number, points, inputs, rise, tared, seconds)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -20,10 +20,11 @@ from scipy.optimize import brentq
 from fem import surface
 from fem.emulator_errors import Errors
 from fem.emulator_limits import check, within
+from fem.ground import cubic
 from fem.mesh import Geometry
 from fem.model import Inclusion, Probe, Slab
 from fem.regression import Regression
-from fem.sampling import CLEARANCE, Plan, contrast, cubic, lines
+from fem.sampling import CLEARANCE, Plan, contrast, lines
 from fem.solving import knots
 from fem.symmetry import Image, images, unfold
 from fem.topology import Resolution
@@ -31,9 +32,9 @@ from fem.topology import Resolution
 Floats = NDArray[np.float64]
 
 
-CENTRED = [0, 1, 4, 5, 6]
-"""The inputs that are no offsets: all that the gain from a finer mesh depends on, in the mesh's
-coordinates."""
+CENTRED = [0, 1, 4, 5, 6, 7]
+"""The inputs that are no offsets: all that the gain from a finer mesh depends on, in the mesh's coordinates;
+the last one at finite strain only."""
 
 
 @dataclass(frozen=True)
@@ -81,8 +82,9 @@ class Emulator:
         What the inclusion adds, as `sampling.solve` gives it, over `amplitudes`.
     finer
         What a finer mesh adds to the rise, as `sampling.refine` gives it, over `amplitudes`.
-    rise_more, tared_more
-        What finite strain adds, as `sampling.stretch` gives it, over `amplitudes`; None for a linear one.
+    rise_more, tared_more, finer_more
+        What finite strain adds, as `sampling.stretch` gives it, and what the finer mesh adds to its rise, as
+        `sampling.refine_stretch` does, over `amplitudes`; None for a linear one.
     errors
         From cross-validation.
     """
@@ -96,6 +98,7 @@ class Emulator:
     finer: Regression
     rise_more: Regression | None
     tared_more: Regression | None
+    finer_more: Regression | None
     errors: Errors
 
     def __call__(
@@ -234,12 +237,14 @@ def _pressed(
 
 @dataclass(frozen=True)
 class _Learned:
-    """What the regressions say of a specimen: fields over the ratios (k, ...), of a lean mesh over levels."""
+    """What the regressions say of a specimen: flat fields on a mesh for each ratio of moduli, and what finite
+    strain adds for each level."""
 
     point: Floats
     rise: Floats
     tared: Floats
-    more: tuple[Floats, Floats] | None
+    finer: Floats
+    more: tuple[Floats, Floats, Floats] | None
 
 
 def _learned(emulator: Emulator, specimens: Sequence[tuple[Slab, Inclusion]]) -> list[_Learned]:
@@ -257,13 +262,20 @@ def _learned(emulator: Emulator, specimens: Sequence[tuple[Slab, Inclusion]]) ->
     rows = np.array(points)
     inputs = features(plan, rows)
     linear = inputs[:, :-1]
-    rise = emulator.rise(linear) + emulator.finer(linear[:, CENTRED])
-    small = _blended(seen, rise, emulator.tared(linear), len(plan.ratios))
-    more: Sequence[tuple[Floats, Floats] | None] = [None] * len(small)
-    if emulator.rise_more is not None and emulator.tared_more is not None:
-        more = _blended(seen, emulator.rise_more(inputs), emulator.tared_more(inputs), len(plan.levels) - 1)
     first = np.unique([number for number, _ in seen], return_index=True)[1]
-    return [_Learned(*parts) for parts in zip(rows[first], *zip(*small, strict=True), more, strict=True)]
+    centred = inputs[first][:, CENTRED]  # of no image: it is symmetric
+    ratios, levels = len(plan.ratios), len(plan.levels) - 1
+    small = _blended(seen, emulator.rise(linear), emulator.tared(linear), ratios)
+    finer = emulator.finer(centred[:, :-1]).reshape(len(first), ratios, -1)
+    found = [
+        _Learned(point, rise, tared, gain, None)
+        for point, (rise, tared), gain in zip(rows[first], small, finer, strict=True)
+    ]
+    if emulator.rise_more is None or emulator.tared_more is None or emulator.finer_more is None:
+        return found
+    more = _blended(seen, emulator.rise_more(inputs), emulator.tared_more(inputs), levels)
+    finer = emulator.finer_more(centred).reshape(len(first), levels, -1)
+    return [replace(one, more=(*two, gain)) for one, two, gain in zip(found, more, finer, strict=True)]
 
 
 def _blended(
@@ -291,28 +303,32 @@ def signals(
     plan, s = emulator.plan, float(learned.point[-1])
     geometry = Geometry(plan.probe, slab, inclusion)
     along = lagrange(contrast(plan.ratios), s)
-    onto = resample(geometry, plan.resolution, emulator.x)
-    first = _on_grid(onto, along @ learned.rise, along @ learned.tared)
-    if learned.more is not None:
-        onto = resample(geometry, plan.coarse, emulator.x)
+    fine = resample(geometry, plan.fine, emulator.x)
+    lean, coarse = (resample(geometry, res, emulator.x) for res in (plan.resolution, plan.coarse))
+    first = _on_grid(lean, along @ learned.rise, along @ learned.tared, fine, along @ learned.finer)
     scales, found = amplitudes(learned.point, s), []
     for level in levels:
         parts = [first]
         if learned.more is not None:
-            parts.append(_on_grid(onto, *(level[1:] @ more for more in learned.more)))
+            rise, tared, finer = (level[1:] @ more for more in learned.more)
+            parts.append(_on_grid(coarse, rise, tared, fine, finer))
         whole = (sum(part) for part in zip(*parts, strict=True))
         rise, tared = (scale * part for scale, part in zip(scales, whole, strict=True))
         found.append((rise, tared))
     return found
 
 
-def _on_grid(onto: tuple[Floats, Floats], rise: Floats, tared: Floats) -> tuple[Floats, Floats]:
-    """Carry fields from a mesh's nodes, flat, to the grid, (m, m) and (m, m, 3); see `resample`."""
-    n = onto[0].shape[1]
-    each = tared.reshape(n, n, 3).transpose(2, 0, 1)
-    return onto[0] @ rise.reshape(n, n) @ onto[1].T, np.stack(
-        [onto[0] @ u @ onto[1].T for u in each], axis=-1
-    )
+def _on_grid(
+    onto: tuple[Floats, Floats], rise: Floats, tared: Floats, fine: tuple[Floats, Floats], finer: Floats
+) -> tuple[Floats, Floats]:
+    """Carry fields from a mesh's nodes, flat, to the grid, (m, m) and (m, m, 3), and what a finer mesh adds
+    to the first one from its nodes; see `resample`."""
+    whole = _carried(onto, rise) + _carried(fine, finer)
+    return whole, np.stack([_carried(onto, moved) for moved in tared.reshape(-1, 3).T], axis=-1)
+
+
+def _carried(onto: tuple[Floats, Floats], values: Floats) -> Floats:
+    return np.asarray(onto[0] @ values.reshape(onto[0].shape[1], -1) @ onto[1].T)
 
 
 def amplitudes(points: Floats, s: Floats | float) -> tuple[Floats, Floats]:

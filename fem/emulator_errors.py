@@ -31,20 +31,22 @@ class Errors:
     own maximum off the probe's edge.
 
     `pressure` and `displacement` are of the tared fields, the worst of all levels and moduli solved: largest
-    off the probe's edge (its outermost millimetre), root mean square over the area, and largest at all nodes,
-    (n, 3). At the edge the pressure is singular: what is found there depends on the mesh, and at finite
-    strain scatters by some per cent. `size_mm` (n,) is the inclusion's. `finer` (p, 3): the same of what a
-    finer mesh adds to the tared pressure. `curve` (rows, 9): number of samples at small and at finite strain,
-    core seconds they took, and of a common set of held-out samples with `size_mm` >= 4 the median and the
-    95th percentile of each of the pressure's three errors. `solves` (3, 2): of samples, of pairs of a fine
-    and a lean mesh, and of samples at finite strain, how many were tried, and how many of them failed and are
-    missing from all this.
+    off the probe's edge (its outermost millimetre), root mean square over the area, and largest at all
+    nodes, (n, 3). At the edge the pressure is singular: what is found there depends on the mesh, and at
+    finite strain scatters by some per cent. `size_mm` (n,) is the inclusion's. `finer` (p, 3),
+    `finer_more` (q, 3): the same of what a finer mesh adds to the tared pressure of centred samples, and
+    to what finite strain adds to it (q 0 for a linear one). `curve` (rows, 9): number of samples at small
+    and at finite strain, core seconds they took, and of a common set of held-out samples with `size_mm`
+    >= 4 the median and the 95th percentile of each of the pressure's three errors. `solves` (4, 2): of
+    samples, of pairs of a fine and a lean mesh, of samples at finite strain and of pairs of those, how
+    many were tried, and how many of them failed and are missing from all this.
     """
 
     size_mm: Floats
     pressure: Floats
     displacement: Floats
     finer: Floats
+    finer_more: Floats
     curve: Floats
     solves: Floats
 

@@ -23,10 +23,10 @@ from fem.solving import KNOTS
 
 Floats = NDArray[np.float64]
 
-_FORMAT = 5
+_FORMAT = 6
 _LARGEST = 512 * 2**20  # bytes of all arrays
 _REGRESSIONS = ("rise", "tared", "finer")
-_MORE = ("rise_more", "tared_more")  # that finite strain has besides
+_MORE = ("rise_more", "tared_more", "finer_more")  # that finite strain has besides
 _GRIDS = ("x", "pressure", "moved")
 
 
@@ -117,7 +117,7 @@ def _checked(arrays: dict[str, NDArray[Any]]) -> Emulator:
     if ("rise_more.inputs" in arrays) != plan.finite:
         raise ValueError("its arrays are not those of its mechanics")
     m, levels, moduli = len(arrays["x"]), len(plan.levels), len(plan.ratios)
-    lean, coarse = (len(logical_lines(res)) ** 2 for res in (plan.resolution, plan.coarse))
+    lean, coarse, fine = (len(logical_lines(res)) ** 2 for res in (plan.resolution, plan.coarse, plan.fine))
     half = plan.probe.width_mm / 2
     x = arrays["x"]
     if m < 3 or m % 2 == 0 or not (np.diff(x) > 0).all() or not np.allclose(x[[0, -1]], [-half, half]):
@@ -125,16 +125,18 @@ def _checked(arrays: dict[str, NDArray[Any]]) -> Emulator:
     shapes: dict[str, tuple[int, ...]] = {"x": (m,), "pressure": (*KNOTS, levels, m, m)}
     shapes["moved"] = (*KNOTS, levels, m, m, 3)
     for name in _parts(plan):
-        q = 5 if name == "finer" else 8 if name in _MORE else 7
-        values = (levels - 1) * coarse if name in _MORE else moduli * lean
+        finite, finer = name in _MORE, name.startswith("finer")
+        q = (5 if finer else 7) + finite
+        values = (levels - 1 if finite else moduli) * (fine if finer else coarse if finite else lean)
         shapes |= _shapes_of(arrays, name, q, values * (3 if name.startswith("tared") else 1))
-    points, pairs, rows = (len(arrays[f"errors.{k}"]) for k in ("size_mm", "finer", "curve"))
+    points, *pairs, rows = (len(arrays[f"errors.{k}"]) for k in ("size_mm", "finer", "finer_more", "curve"))
     shapes |= {
         "errors.size_mm": (points,),
         "errors.pressure": (points, 3),
         "errors.displacement": (points, 3),
     }
-    shapes |= {"errors.finer": (pairs, 3), "errors.curve": (rows, 9), "errors.solves": (3, 2)}
+    shapes |= {"errors.finer": (pairs[0], 3), "errors.finer_more": (pairs[1], 3)}
+    shapes |= {"errors.curve": (rows, 9), "errors.solves": (4, 2)}
     for name, shape in shapes.items():
         if arrays[name].shape != shape:
             raise ValueError(f"{name} has shape {arrays[name].shape}, not {shape}")

@@ -168,10 +168,25 @@ def _roots(own: tuple[Floats, Floats], known: list[NDArray[np.bool_]]) -> list[F
 
 def carry(values: Floats, own: tuple[Floats, Floats], to: tuple[Floats, Floats]) -> Floats:
     """Field (n, ...) of a surface's points on its grid lines, at those of another, by cubic splines."""
-    onto = [make_interp_spline(a, np.eye(a.size), k=3)(b) for a, b in zip(own, to, strict=True)]
+    onto = [cubic(a, b) for a, b in zip(own, to, strict=True)]
     grid = values.reshape(own[0].size, own[1].size, -1)
     found = np.einsum("ai,ijc,bj->abc", onto[0], grid, onto[1], optimize=True)
     return np.asarray(found.reshape(-1, *values.shape[1:]))
+
+
+def cubic(nodes: Floats, at: Floats) -> Floats:
+    """Weights (m, n) of the values at the nodes of a line, (n,), at places (m,): the cubic spline through
+    them, without a knot at the nodes next to the ends. Unlike the elements' own shapes, what it gives at a
+    fixed place has no kinks where nodes pass it, as they do when an inclusion moves."""
+    return _cubic(nodes.tobytes(), at.tobytes())
+
+
+@lru_cache(maxsize=256)  # specimens whose nodes are the same follow each other when slopes are found
+def _cubic(nodes: bytes, at: bytes) -> Floats:
+    line = np.frombuffer(nodes)
+    found = np.asarray(make_interp_spline(line, np.eye(line.size), k=3)(np.frombuffer(at)))
+    found.flags.writeable = False
+    return found
 
 
 def lines(contact: pv.PolyData) -> tuple[Floats, Floats]:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fem.model import NotConverged, NotModelled
-from fem.sampling import PLAN, NotBuilt, Plan, background, refine, solve, stretch
+from fem.sampling import PLAN, NotBuilt, Plan, background, refine, refine_stretch, solve, stretch
 
 Floats = NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -29,11 +29,11 @@ _DEAD = (
     "workers: received one that ended by itself, killed or out of memory; allowed are as many as the memory "
     "holds (what is solved is kept: the same call goes on)"
 )
-_FORMAT = 4  # of the files in a folder
-SHARE = 8  # samples for each pair of a fine and a lean mesh
+_FORMAT = 5  # of the files in a folder
+_SHARES = {"pair": 8, "stretched_pair": 16}  # samples for each pair of a fine and a lean or coarse mesh
 STRETCHED = 3  # samples for each one at finite strain, which is the same specimen as an earlier one
-_FIRST = 16  # pairs that come with one sample each
-KNOTS = (3, 3)  # Chebyshev nodes of the background along thickness and tissue: 0.1 % off between them
+_FIRST = 16  # pairs of each kind that come with one sample each
+KNOTS = (4, 4)  # Chebyshev nodes of the background along thickness and tissue: 0.01 % off between them
 
 
 def chebyshev(low: float, high: float, nodes: int) -> Floats:
@@ -52,7 +52,7 @@ def knots(plan: Plan) -> tuple[Floats, Floats]:
 
 
 def file_of(folder: Path, kind: str, number: int) -> Path:
-    """Where a solve is kept: kind "background", "sample", "pair" or "stretch"."""
+    """Where a solve is kept: kind "background" or one of `_SOLVES`."""
     return folder / f"{kind}-{number:05d}.npz"
 
 
@@ -124,13 +124,15 @@ def _tasks(plan: Plan, folder: Path, samples: int | None) -> Iterator[tuple[str,
     """What is still to solve, in order; pairs are spread evenly among the samples."""
 
     def order() -> Iterator[tuple[str, int]]:
-        pairs = 0
+        shares = _SHARES if plan.finite else {"pair": _SHARES["pair"]}
+        pairs = dict.fromkeys(shares, 0)
         for number in range(KNOTS[0] * KNOTS[1]):
             yield "background", number
         for number in count() if samples is None else range(samples):
-            while pairs <= max(min(number, _FIRST - 1), number // SHARE):
-                yield "pair", pairs
-                pairs += 1
+            for kind, share in shares.items():
+                while pairs[kind] <= max(min(number, _FIRST - 1), number // share):
+                    yield kind, pairs[kind]
+                    pairs[kind] += 1
             yield "sample", number
             if plan.finite and number % STRETCHED == 0:
                 yield "stretch", number // STRETCHED
@@ -155,7 +157,7 @@ def _end_with_parent() -> None:
 
 # what a solve that finds no equilibrium ends in
 _UNSOLVED = (NotConverged, NotModelled, ArithmeticError, np.linalg.LinAlgError)
-_SOLVES = {"sample": solve, "pair": refine, "stretch": stretch}
+_SOLVES = {"sample": solve, "pair": refine, "stretch": stretch, "stretched_pair": refine_stretch}
 
 
 def _work(plan_json: bytes, folder: str, kind: str, number: int) -> None:

@@ -54,16 +54,18 @@ def invented(mechanics: str = "linear") -> Emulator:
     bump = np.exp(-(np.linspace(-3, 3, n) ** 2))
     bump = 0.09 * np.multiply.outer(bump, bump)
     into = bump[..., None] * [0.0, 0.0, -0.1]
-    more = [None, None]
+    more = [None, None, None]
     if plan.finite:
-        more = [constant(np.stack([0.1 * k * b for k in (1, 2, 3)]), 8) for b in (bump, into)]
+        parts = (bump, 8), (into, 8), (0 * bump, 6)
+        more = [constant(np.stack([0.1 * k * b for k in (1, 2, 3)]), inputs) for b, inputs in parts]
     errors = Errors(
         np.full(20, 8.0),
         np.ones((20, 3)),
         np.full((20, 3), 1.5),
         np.ones((16, 3)),
+        np.ones((16 if plan.finite else 0, 3)),
         np.zeros((0, 9)),
-        np.zeros((3, 2)),
+        np.zeros((4, 2)),
     )
     known = [np.stack([b] * 3) for b in (bump, into)]
     return Emulator(

@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 import fem
 from fem.emulator_errors import LARGE, Errors
 from twin.captions import percent_in_words
@@ -119,6 +121,10 @@ def summary(emulator: fem.Emulator, out: str) -> str:
     lines += _errors(errors, "inclusions of 4 mm and more", max(smallest, LARGE))
     if smallest < LARGE:
         lines += _errors(errors, "smaller ones", smallest)
+    for what, found in (("", errors.finer), (", what finite strain adds", errors.finer_more)):
+        if len(found):
+            typical, bad = (percent_in_words(float(np.percentile(found[:, 0], p))) for p in (50, 95))
+            lines.append(f"what the standard mesh adds to tared pressure{what}: off by {typical} and {bad}")
     for count, more, seconds, median, bad, *_ in errors.curve:
         solves = f"{count:.0f} samples" + (f" ({more:.0f} at finite strain)" if more else "")
         lines.append(

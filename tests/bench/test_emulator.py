@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import fem
-from fem import mesh
 from fem.emulating import build_emulator, fit
-from fem.emulator import Emulator, resample
+from fem.emulator import Emulator
+from fem.ground import cubic, lines
 from fem.sampling import geometry_at
 from fem.surface import line_weights
 from twin import load_design
@@ -104,7 +104,6 @@ def missed_by(built: Emulator, point: np.ndarray, quality: str) -> list[float]:
     plan = built.plan
     modulus = (1 + 1.5 * point[6]) / (1 - point[6]) * point[5]
     geometry = geometry_at(plan, point, float(np.clip(modulus, *plan.ranges.modulus_kPa)))
-    onto = resample(geometry, mesh.QUALITIES[quality], built.x)
     area = np.outer(line_weights(built.x), line_weights(built.x)) / plan.probe.width_mm**2
     levels, out = [1.0, 2.0, 3.0], []
     assert geometry.inclusion is not None
@@ -117,7 +116,8 @@ def missed_by(built: Emulator, point: np.ndarray, quality: str) -> list[float]:
         quality=quality,
         estimate=False,
     )
-    for level, press in zip(levels, presses, strict=True):
+    for level, press in zip(levels, fem.on_background(presses), strict=True):
+        onto = [cubic(line, built.x) for line in lines(press.surface)]
         true = onto[0] @ _tared(press) @ onto[1].T
         miss = _tared(built(plan.probe, geometry.slab, geometry.inclusion, level)) - true
         inner = np.abs(miss[1:-1, 1:-1]).max()
