@@ -303,8 +303,8 @@ def signals(
     plan, s = emulator.plan, float(learned.point[-1])
     geometry = Geometry(plan.probe, slab, inclusion)
     along = lagrange(contrast(plan.ratios), s)
-    fine = resample(geometry, plan.fine, emulator.x)
-    lean, coarse = (resample(geometry, res, emulator.x) for res in (plan.resolution, plan.coarse))
+    lean, fine = (resample(geometry, res, emulator.x) for res in (plan.resolution, plan.fine))
+    coarse = lean if learned.more is None else resample(geometry, plan.coarse, emulator.x)
     first = _on_grid(lean, along @ learned.rise, along @ learned.tared, fine, along @ learned.finer)
     scales, found = amplitudes(learned.point, s), []
     for level in levels:

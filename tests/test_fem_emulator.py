@@ -16,8 +16,9 @@ from fem.emulator import Emulator, lagrange, resample, signals
 from fem.emulator_errors import FEWEST, Errors, off_the_edge
 from fem.emulator_file import NotAnEmulator, load_emulator, save_emulator
 from fem.emulator_limits import check
+from fem.ground import cubic
 from fem.regression import Regression, regress
-from fem.sampling import Plan, Ranges, background, cubic, geometry_at, solve
+from fem.sampling import Plan, Ranges, background, geometry_at, solve
 from fem.solving import knots
 from fem.symmetry import unfold
 from fem.topology import Resolution
@@ -76,9 +77,9 @@ def test_what_never_changes_is_learned_too() -> None:
     assert regress(x, np.full((20, 3), 4.0))(x[:5]) == pytest.approx(4.0)
 
 
-def test_quadratic_and_polynomial_weights_are_exact() -> None:
+def test_cubic_and_polynomial_weights_are_exact() -> None:
     nodes, at = np.array([-1.0, 0.5, 1.0, 2.0, 4.0]), np.linspace(-1, 4, 11)
-    assert cubic(nodes, at) @ (nodes**2 - nodes) == pytest.approx(at**2 - at)
+    assert cubic(nodes, at) @ (nodes**3 - nodes) == pytest.approx(at**3 - at)
     assert lagrange(nodes, 0.3) @ nodes**4 == pytest.approx(0.3**4)
 
 

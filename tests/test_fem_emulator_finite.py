@@ -6,18 +6,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_fem_emulator import COARSE, INCLUSION, PLAN, PROBE, RANGES, SLAB, grids
+from test_fem_emulator import COARSE, FINER, INCLUSION, PLAN, PROBE, RANGES, SLAB, grids, silent
 
 import fem
 from fem.emulating import build_emulator
 from fem.emulator import Emulator, lagrange, resample, signals
+from fem.emulator_errors import off_the_edge
 from fem.emulator_file import NotAnEmulator, load_emulator, save_emulator
 from fem.mesh import Geometry
 from fem.pressing import _presses
 from fem.sampling import Plan, contrast, geometry_at, solve, stretch
 from fem.solving import file_of, solved, tally
 
-FINITE = replace(PLAN, mechanics="finite", coarse=COARSE, fine=COARSE)
+FINITE = replace(PLAN, mechanics="finite", coarse=COARSE, fine=FINER)
 SAMPLES = 40
 
 
@@ -70,13 +71,36 @@ def emulator(tmp_path_factory: pytest.TempPathFactory) -> Emulator:
     return build_emulator(FINITE, tmp_path_factory.mktemp("finite"), samples=SAMPLES, workers=2)
 
 
+def without_gains(emulator: Emulator) -> Emulator:
+    """What its samples say, on their own mesh."""
+    assert emulator.finer_more is not None
+    return replace(emulator, finer=silent(emulator.finer), finer_more=silent(emulator.finer_more))
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_what_a_finer_mesh_adds_to_finite_strain_makes_up_for_the_coarse_one(emulator: Emulator) -> None:
+    """What finite strain adds under the middle is the finer mesh's, of a press that no sample has."""
+    s = float(np.mean(FINITE.signals))
+    point = np.array([8.2, 5.4, 0.0, 0.0, 28.3, 5.1, s])
+    geometry = geometry_at(FINITE, point, float((1 + 1.5 * s) / (1 - s) * point[5]))
+    assert geometry.inclusion is not None
+    onto = resample(geometry, FINER, emulator.x)
+    true = onto[0] @ stretch(replace(FINITE, coarse=FINER), point)["rise"][1] @ onto[1].T
+    level, still = lagrange(FINITE.levels, float(FINITE.levels[2])), np.eye(4)[0]
+    off = []
+    for one in (emulator, replace(emulator, finer_more=without_gains(emulator).finer_more)):
+        (guess, _), (small, _) = signals(one, geometry.slab, geometry.inclusion, [level, still])
+        off.append(np.abs(guess - small - true)[off_the_edge(emulator.x)].max())
+    assert off[0] < 0.2 * off[1] and off[0] < 0.03 * np.abs(true).max()
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
 def test_presses_between_the_levels_are_met(emulator: Emulator) -> None:
     """Finite presses of specimens and depths that no sample has, as far away as cross-validation says."""
     other, errors = replace(FINITE, seed=99), []
-    silent = replace(emulator.finer, mean=0 * emulator.finer.mean, modes=0 * emulator.finer.modes)
-    lean = replace(emulator, finer=silent)  # on the samples' own mesh
+    lean = without_gains(emulator)  # on the samples' own mesh
     for number in (0, 4, 8):
         point = other.point(number)
         geometry = geometry_at(FINITE, point, float(FINITE.ratios[1] * point[5]))
