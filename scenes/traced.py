@@ -3,15 +3,15 @@
 Light that is not gathered has walked far through the guide and carries the Monte Carlo noise, which in blocks
 of pixels is above the camera's (`tests/test_traced.py`). It changes little and smoothly from press to press:
 here its maps are a mean plus a few modes, whose amounts are smooth functions (`kriging`) of the leading
-principal components of real contact fraction and displacement. A picture that takes it
-(`Renderer.render(traced=...)`) has no noise of its own and is the same function of the press every time, so
-that pictures can be compared and differentiated.
+principal components of real contact fraction and displacement, of presses without inclusion and of what
+inclusions add to them. A picture that takes it (`Renderer.render(traced=...)`) has no noise of its own and is
+the same function of the press every time, so that pictures can be compared and differentiated.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -25,16 +25,17 @@ from .surface import OpticalSurface
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 
-_INPUTS = 10  # principal components
-_DISPLACED = 2.0  # weight of displacements among them, that of contact fractions is 1
+_STATES, _ADDED = 6, 12  # principal components without inclusion, and of what inclusions add
+_DISPLACED = 4.0  # weight of displacements among them, that of contact fractions is 1
 _LEADING, _AREAS, _OUTPUTS = 4, 5, 30
 """What lengths are found from: leading maps of the light, areas per side, their principal components."""
-_MODES = 16
+_MODES = 40
+_STRESS = 3.0  # what inclusions change is so much of what presses change, times as much in the modes
 _FEWEST = 40  # presses
-_COARSE = 50  # cells per side on which modes are kept
+_COARSE = 50  # cells per side on which modes are kept, and contact fraction is looked at
 _FINE = 100  # on which their mean is
 _BEYOND = 2.0  # how far inputs may leave what was learned, times its reach
-FORMAT = "tsis-traced-3"
+FORMAT = "tsis-traced-4"
 LIGHT = 11
 """Counts up when pictures of the same press change: what was learned or kept before is of no use then.
 9: windows of other LEDs in painted walls, thin sheets that hardly scatter; 10: tissue whose scatterings
@@ -43,7 +44,7 @@ BIAS_SINCE = 5
 """The first light of which a quality's measured bias holds: what changed since is common to all qualities, or
 less than the bias is known to (LIGHT 7, 8: 0.11 % in a blob, 0.09 % in a background), or touches no measured
 design (9, 10), or is noise (11)."""
-ARRAYS = ("centre", "axes", "nodes", "weights", "mean", "modes")
+ARRAYS = ("centre", "axes", "nodes", "weights", "kernel", "mean", "modes")
 """Fields of `TracedLight` that are arrays."""
 
 
@@ -57,9 +58,10 @@ class TracedLight:
     centre, axes : (d,) and (d, inputs); inputs of a press are (its description - centre) @ axes, in units of
         the lengths over which light changes.
     nodes : (presses, inputs) of those that were learned.
-    weights : (1 + presses, modes) amounts of the modes, of `kriging.terms`.
+    weights : (1 + presses, modes) amounts of the modes, of `kriging.Kernel.terms`.
+    kernel : (3,) what a `kriging.Kernel` is made of.
     mean : (n_led, layers, m, m), 1/mm².
-    modes : (modes, n_led, layers, 50, 50), 1/mm².
+    modes : (modes, n_led, layers, 50, 50), 1/mm²; at most 1, kept in half precision.
     error_percent : root mean square over the presses, each left out in turn, of the error of the leading map,
         all of it together, in per cent; the noise of what was traced is in it.
     """
@@ -69,6 +71,7 @@ class TracedLight:
     axes: Array
     nodes: Array
     weights: Array
+    kernel: Array
     mean: Single
     modes: Single
     error_percent: float
@@ -102,7 +105,8 @@ class TracedLight:
             raise NotModelled(
                 f"traced: received a press {far:.2g} times as far out as those learned; allowed {_BEYOND:g}"
             )
-        amounts = (kriging.terms(inputs[None], self.nodes)[0] @ self.weights).astype(np.float32)
+        kernel = kriging.Kernel(int(self.kernel[0]), *(float(one) for one in self.kernel[1:]))
+        amounts = (kernel.terms(inputs[None], self.nodes)[0] @ self.weights).astype(np.float32)
         cells = cells or fraction.shape[0]
         found = _enlarged(self.mean, cells)
         found += _enlarged(np.tensordot(amounts, self.modes, 1), cells)
@@ -164,58 +168,75 @@ def describe(shape: OpticalSurface, fraction: Array) -> Array:
 def learn(
     sensor: Sensor,
     descriptions: Sequence[NDArray[np.floating]],
-    traced: Sequence[NDArray[np.floating]],
+    traced: Iterable[NDArray[np.floating]],
 ) -> TracedLight:
-    """Learn from presses of one sensor.
+    """Learn from presses of one sensor, in pairs: with an inclusion and without, by the same light paths.
 
     Parameters
     ----------
     descriptions : (n, d) from `describe`.
-    traced : n maps (n_led, layers, g, g), W/mm², `Rendering.traced` of one band.
+    traced : n maps (n_led, layers, g, g), W/mm², `Rendering.traced` of one band; taken one by one.
     """
-    n = len(traced)
-    if n < _FEWEST or len(descriptions) != n:
-        raise ValueError(f"traced: received {n} maps; allowed {_FEWEST} or more, one for each description")
+    n = len(descriptions)
+    if n < _FEWEST or n % 2:
+        raise ValueError(f"traced: received {n} descriptions; allowed {_FEWEST} or more, in pairs")
     x = np.asarray(descriptions, np.float64)
-    centre = x.mean(axis=0)
-    x = x - centre
+    centre = x[1::2].mean(axis=0)
+    x -= centre
     cells = _COARSE**2
-    moved = x[:, cells:].std() / _DISPLACED
-    scale = np.concatenate([np.full(cells, x[:, :cells].std()), np.full(x.shape[1] - cells, moved)])
-    _, size, axes = np.linalg.svd(x / scale, full_matrices=False)
-    axes = axes[:_INPUTS].T / scale[:, None] * (np.sqrt(n) / size[:_INPUTS])
+    scale = np.full(x.shape[1], (x[:, cells:] - x[:, cells:].mean(axis=0)).std() / _DISPLACED)
+    scale[:cells] = (x[:, :cells] - x[:, :cells].mean(axis=0)).std()
+    state = _principal(x[1::2] / scale, _STATES)
+    added = (x[::2] - x[1::2]) / scale
+    axes = np.concatenate([state, _principal(added - added @ state.T @ state, _ADDED)]).T / scale[:, None]
     flux = np.array([led.flux_W for led in sensor.leds])[:, None, None, None]
-    fine = min(traced[0].shape[-1], _FINE)
-    mean = np.zeros((*traced[0].shape[:2], fine, fine))
-    coarse = np.empty((n, *traced[0].shape[:2], _COARSE, _COARSE), np.float32)
+    mean, coarse = np.zeros(()), np.zeros((), np.float32)
     for number, maps in enumerate(traced):
         # an LED that is dark in this band, its light being in another, stands in the way here all the same
         whole = np.asarray(maps, np.float64)
         per_watt = np.divide(whole, flux, out=np.zeros_like(whole), where=flux > 0.0)
+        if number == 0:
+            fine = min(whole.shape[-1], _FINE)
+            mean = np.zeros((*whole.shape[:2], fine, fine))
+            coarse = np.empty((n, *whole.shape[:2], _COARSE, _COARSE), np.float32)
         mean += blocks(per_watt, fine) / n
         coarse[number] = blocks(per_watt, _COARSE)
-    lengths, noise = kriging.lengths(x @ axes, _leading(coarse))
+    lengths, kernel, noise = kriging.fit(x @ axes, len(state), _leading(coarse))
     axes = axes / lengths
     nodes = x @ axes
     total = coarse[:, :, 0].sum(axis=(1, 2, 3), dtype=np.float64)
-    missed = kriging.left_out(nodes, (total - total.mean())[:, None], noise)[:, 0] / total
+    missed = kriging.left_out(kernel, nodes, (total - total.mean())[:, None], noise)[:, 0] / total
     flat = coarse.reshape(n, -1)
     flat -= flat.mean(axis=0)
-    weigh = kriging.weights(nodes, np.eye(n), noise)  # the maps are many: weights of the presses, then theirs
-    fitted = (kriging.terms(nodes, nodes) @ weigh).astype(np.float32) @ flat
-    values, vectors = np.linalg.eigh(np.asarray(fitted @ fitted.T, np.float64))
+    weigh = kriging.weights(
+        kernel, nodes, np.eye(n), noise
+    )  # the maps are many: weights of the presses, then theirs
+    smooth = kernel.terms(nodes, nodes) @ weigh
+    told = np.concatenate([smooth[1::2], _STRESS * (smooth[::2] - smooth[1::2])]).astype(np.float32)
+    values, vectors = np.linalg.eigh(np.asarray(told @ (flat @ flat.T) @ told.T, np.float64))
     first = np.argsort(values)[::-1][:_MODES]
-    modes = vectors[:, first].T.astype(np.float32) @ fitted
+    first = first[values[first] > 1e-10 * values[first[0]]]
+    modes = (vectors[:, first].T.astype(np.float32) @ told) @ flat
+    amounts = flat @ modes.T / values[first]
+    largest = np.abs(modes).max(axis=1)
+    modes /= largest[:, None]
     return TracedLight(
         optics_key(sensor),
         centre,
         axes,
         nodes,
-        weigh @ (flat @ modes.T) / values[first],
+        weigh @ (amounts * largest),
+        np.array([kernel.states, kernel.slower, kernel.bend]),
         mean.astype(np.float32),
-        modes.reshape(-1, *coarse.shape[1:]),
+        modes.astype(np.float16).astype(np.float32).reshape(-1, *coarse.shape[1:]),
         100.0 * float(np.sqrt(np.mean(missed**2))),
     )
+
+
+def _principal(rows: Array, count: int) -> Array:
+    """Directions (count, d) in which rows (n, d) are largest; fewer where they are in fewer."""
+    _, size, directions = np.linalg.svd(rows, full_matrices=False)
+    return np.asarray(directions[:count][size[:count] > 1e-6 * size[0]])
 
 
 def _leading(maps: Single) -> Array:
@@ -231,6 +252,7 @@ def save(light: Sequence[TracedLight], path: str | Path) -> None:
     arrays: dict[str, NDArray[np.generic]] = {"format": np.array(FORMAT), "bands": np.array(len(light))}
     for number, one in enumerate(light):
         arrays |= {f"{number}.{name}": np.asarray(value) for name, value in vars(one).items()}
+        arrays[f"{number}.modes"] = one.modes.astype(np.float16)
     with open(path, "wb") as file:
         np.savez_compressed(file, allow_pickle=False, **arrays)
 
@@ -262,13 +284,16 @@ def assembled(arrays: Mapping[str, NDArray[np.generic]], key: str, error_percent
             raise ValueError(name)
     if arrays["axes"].ndim != 2 or not np.isfinite(error_percent):
         raise ValueError("axes, error_percent")
-    centre, axes, nodes, weights = (
-        np.asarray(arrays[name], np.float64) for name in ("centre", "axes", "nodes", "weights")
+    centre, axes, nodes, weights, kernel = (
+        np.asarray(arrays[name], np.float64) for name in ("centre", "axes", "nodes", "weights", "kernel")
     )
     mean, modes = (np.asarray(arrays[name], np.float32) for name in ("mean", "modes"))
     k, m = axes.shape[1], len(modes)
     fits = (
-        axes.shape == (len(centre), _INPUTS)
+        axes.shape == (len(centre), k)
+        and kernel.shape == (3,)
+        and kernel[0] in range(1, k)
+        and (kernel[1:] > 0.0).all()
         and nodes.shape == (len(nodes), k)
         and (np.abs(nodes).max(axis=0) > 0.0).all()
         and weights.shape == (1 + len(nodes), m)
@@ -278,7 +303,7 @@ def assembled(arrays: Mapping[str, NDArray[np.generic]], key: str, error_percent
     )
     if not fits:
         raise ValueError("shapes")
-    return TracedLight(key, centre, axes, nodes, weights, mean, modes, error_percent)
+    return TracedLight(key, centre, axes, nodes, weights, kernel, mean, modes, error_percent)
 
 
 def _coarse(cells: Array) -> Array:

@@ -23,20 +23,22 @@ from twin.retake import average
 
 
 def presses(n: int, seed: int) -> tuple[list[OpticalSurface], list[np.ndarray], list[np.ndarray]]:
-    """Dents of three hidden numbers, and light that is a quadratic of them."""
+    """Dents of two hidden numbers, in pairs with and without a third; light is a quadratic of them."""
     rng = np.random.default_rng(seed)
     line = np.linspace(-12.5, 12.5, 65)
     shapes = [np.cos(np.add.outer(k * line / 5.0, line / (2.0 + k))) for k in range(3)]
     cells = np.linspace(-1, 1, 100)
     patterns = [np.exp(-np.add.outer((cells - 0.2 * k) ** 2, cells**2)) for k in range(-2, 3)]
     surfaces, fractions, light = [], [], []
-    for hidden in rng.uniform(-1, 1, (n, 3)):
+    hiddens = np.repeat(rng.uniform(-1, 1, ((n + 1) // 2, 3)), 2, axis=0)[:n]
+    hiddens[1::2, 2] = 0.0
+    for hidden in hiddens:
         moved = np.zeros((65, 65, 3))
         moved[..., 2] = -0.1 * sum(h * shape for h, shape in zip(hidden, shapes, strict=True))
         surfaces.append(OpticalSurface(line, moved, np.ones((65, 65)), np.zeros((65, 65))))
         fraction = 0.3 + 0.1 * sum(h * p for h, p in zip(hidden, patterns, strict=False))
         fractions.append(fraction)
-        amounts = [1.0, *(0.1 * hidden), 0.05 * hidden[0] ** 2]
+        amounts = [1.0, *(0.1 * hidden), 0.05 * hidden[0] * (hidden[0] + hidden[2])]
         one = sum(a * p for a, p in zip(amounts, patterns, strict=True))
         light.append(0.01 * np.broadcast_to(one, (4, 2, 100, 100)))
     return surfaces, fractions, light
@@ -63,6 +65,30 @@ def test_smooth_light_is_recovered(learned, sensor):
         found = learned.at(sensor, surface, fraction) * 0.01 / sensor.leds[0].flux_W
         assert np.abs(found - light).max() < 3e-3 * light.max()
     assert learned.error_percent < 0.2
+
+
+def test_what_an_inclusion_changes_is_told_better_than_the_whole(learned, sensor):
+    """Its light is an eighth of what presses differ by, and follows them."""
+    surfaces, fractions, light = presses(40, 4)
+    found = np.stack([learned.at(sensor, *one) for one in zip(surfaces, fractions, strict=True)])
+    miss, signal = (one[::2] - one[1::2] for one in (found - np.stack(light), np.stack(light)))
+    assert np.sqrt((miss**2).mean()) < 0.01 * np.sqrt((signal**2).mean())
+
+
+def test_pairs_share_what_tracing_is_off_by(sensor):
+    """Noise of one for both, as large as the inclusion's light: what is left of it there is a tenth."""
+    surfaces, fractions, light = presses(120, 0)
+    told = [traced.describe(*one) for one in zip(surfaces, fractions, strict=True)]
+    rng = np.random.default_rng(5)
+    cells = np.linspace(-1, 1, 100)
+    wave = np.cos(2.0 * cells) * np.cos(3.0 * cells[:, None])
+    off = 1e-3 * np.repeat(rng.standard_normal(60), 2)
+    learned = traced.learn(sensor, told, [one + x * wave for one, x in zip(light, off, strict=True)])
+    surfaces, fractions, light = presses(40, 4)
+    found = np.stack([learned.at(sensor, *one) for one in zip(surfaces, fractions, strict=True)])
+    error = found - np.stack(light)
+    miss = error[::2] - error[1::2]
+    assert np.sqrt((miss**2).mean()) < 0.1 * np.sqrt(2.0) * 1e-3 * np.sqrt((wave**2).mean())
 
 
 def test_light_follows_the_leds_power(learned, sensor):
@@ -168,6 +194,10 @@ def test_hostile_files_are_refused(learned, tmp_path):
         {"nodes": learned.nodes[:, :1]},
         {"nodes": learned.nodes[1:]},
         {"nodes": 0.0 * learned.nodes},
+        {"kernel": learned.kernel[:2]},
+        {"kernel": np.array([1.5, 1.0, 1.0])},
+        {"kernel": np.array([99.0, 1.0, 1.0])},
+        {"kernel": np.array([1.0, 0.0, 1.0])},
     ):
         traced.save([replace(learned, **change)], place)
         with pytest.raises(NotModelled, match="no traced light"):
@@ -207,9 +237,11 @@ def test_files_of_an_earlier_light_are_refused_in_one_line(sensor, tmp_path, mon
 
 
 def test_presses_traced_for_an_earlier_light_or_another_design_are_traced_anew(tmp_path, monkeypatch):
-    task = learn_light.Task(small(), fem.Inclusion(10, 5, 100), 2.0, "", 0, False, tmp_path / "0.0000.npz")
+    task = learn_light.Task(small(), fem.Inclusion(10, 5, 100), 2.0, "", 0, tmp_path / "0.0000.npz")
     arrays = {"description": np.zeros(3), "traced.0": np.zeros((1, 2, 4, 4))}
-    learn_light._write(task.place, {"mark": np.array(learn_light._mark(task)), **arrays})
+    for path in learn_light._files(task):
+        assert not learn_light._kept(task)  # nor the press alone
+        learn_light._write(path, {"mark": np.array(learn_light._mark(task)), **arrays})
     assert learn_light._kept(task) and len(learn_light._read(task.place)[1]) == 1
     camera = replace(task.design, name="another")
     for other in (replace(task, depth_mm=1.0), replace(task, design=camera)):

@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 
 import twin
 from twin import index, sample, store
-from twin.calibrate import _drawn, calibrate, calibrated
+from twin.calibrate import _drawn, calibrate, calibrated, check_paths
 from twin.complaint import DesignError
 from twin.discrepancy import Discrepancy
 from twin.estimator import Estimator, Sight, black
@@ -129,6 +129,13 @@ def test_only_a_model_that_renders_is_calibrated(corpus, model, tmp_path):
     with pytest.raises(DesignError, match="without learned light"):
         calibrate(model, corpus, tmp_path / "m")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_samples_of_the_same_light_paths_calibrate_nothing(tmp_path):
+    plan = load_plan(freeze_tiny(tmp_path, 3, (1.0,)))
+    check_paths(replace(plan, head=replace(plan.head, light_seed="own")))
+    with pytest.raises(DesignError, match=r"light_seed: received 'shared'; allowed \"own\""):
+        check_paths(plan)
 
 
 def test_known_pictures_tell_how_far_others_are_off(model):

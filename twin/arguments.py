@@ -178,7 +178,7 @@ def _parser() -> Parser:
     )
     emulate.add_argument("--samples", type=whole, metavar="N", help="stop at so many samples")
     emulate.add_argument(
-        "--light", action="store_true", help="learn the traced light of presses instead (20 min on 2 cores)"
+        "--light", action="store_true", help="learn the traced light of presses instead (40 min on 2 cores)"
     )
     emulate.add_argument(
         "--emulator",

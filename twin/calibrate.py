@@ -30,6 +30,7 @@ from twin.estimator_file import emulator_of, file_of, load_estimator, save_estim
 from twin.fitting import inside, reachable
 from twin.frame import versions
 from twin.imagined import Brightness, mean_variance, pictures
+from twin.planned import Plan
 from twin.pooled import each
 from twin.rendered import rendered
 from twin.train import LIKE, likeness_of
@@ -63,7 +64,8 @@ def calibrate(
     Raises
     ------
     DesignError
-        In one line: for another sensor, too few samples, a model that renders nothing.
+        In one line: for another sensor, too few samples, a model that renders nothing, and a corpus whose
+        samples share their light paths.
     fem.NotModelled
         In one line, for a sample that the model's emulator does not know.
     """
@@ -75,6 +77,7 @@ def calibrate(
         raise DesignError("MODEL", "one without learned light", allowed, source=str(model))
     if lean:
         shares_of(emulator_of(model), estimator.traced)
+    check_paths(source.plan)
     levels = levels_of(source, estimator)
     numbers = [int(n) for n in source.samples if source.plan.inclusion(int(n)) is not None][:samples]
     if len(numbers) < LEAST:
@@ -114,6 +117,13 @@ def calibrate(
         f"{len(numbers)} inclusions of {source.name}: references are off by {reference:.2f} % of their mean, "
         f"tared pictures by {of_tared:.2f} % of their maximum (root mean square)\nmodel: {place}"
     )
+
+
+def check_paths(plan: Plan) -> None:
+    """Raise `DesignError` where samples share their light paths: what those are off by would pass for what is
+    off everywhere, and that of other paths for nothing."""
+    if plan.traced is None and plan.light_seed == "shared":
+        raise DesignError("light_seed", shown(plan.light_seed), '"own"', source=plan.name)
 
 
 def calibrated(estimator: Estimator, values: list[dict[str, float]], seen: Single, own: Single) -> Estimator:

@@ -30,9 +30,10 @@ from twin.stage import check_file, staged_file
 if TYPE_CHECKING:
     from scenes.traced import TracedLight
 
-PRESSES = 256
-"""Presses that are traced; every fourth without its inclusion, too."""
-_BLANK_EVERY = 4
+PRESSES = 384
+"""Presses that are traced, each with and without its inclusion."""
+_DEEP, _DEEPEST = 1 / 3, 1 / 6
+"""So many of them are in so much of the range of depths, at its deep end: light changes fastest there."""
 _CELLS = 100  # of the maps that are kept, per side
 _NUISANCE = {"specimen.modulus_kPa": 0.15, "specimen.thickness_mm": 0.1, "surface.rms_slope": 0.35}
 """What else differs from press to press: up to so much of its value either way."""
@@ -47,7 +48,6 @@ class Task:
     depth_mm: float
     emulator: str
     seed: int
-    blank: bool
     place: Path
 
 
@@ -102,9 +102,10 @@ def learn_light(
     )
     tell("fit", 1.0)
     sensors = spectral.band_sensors(design.sensor(), count=design.light.bands, at=design.sensor)
-    found = [_read(path) for task in tasks for path in _files(task)]
+    files = [path for task in tasks for path in _files(task)]
+    told = [_read(path)[0] for path in files]
     light = tuple(
-        traced.learn(sensor, [one[0] for one in found], [one[1][number] for one in found])
+        traced.learn(sensor, told, (_read(path)[1][number] for path in files))
         for number, (_, _, sensor) in enumerate(sensors)
     )
     with staged_file(out, "out", ".npz") as place:
@@ -145,16 +146,18 @@ def tasks_of(
             (away * (2 * float(unit[3]) - 1), away * (2 * float(unit[4]) - 1)),
         )
         low, high = ranges.indentation_mm
-        depth = _between((max(low, 0.3 * high), high), unit[5])
+        low = max(low, 0.3 * high)
+        if len(found) >= round((1.0 - _DEEP) * samples):
+            low = high - _DEEPEST * (high - low)
+        depth = _between((low, high), unit[5])
         changed = parse_design(put(tables, fields))
         try:
             presses.check_emulated(changed, inclusion, [depth], emulator)
         except fem.NotModelled:
             continue
         number = len(found)
-        blank = number % _BLANK_EVERY == 0
         place = folder / f"{seed}.{number:04d}.npz"
-        found.append(Task(changed, inclusion, depth, file, seed * 10_000 + number, blank, place))
+        found.append(Task(changed, inclusion, depth, file, seed * 10_000 + number, place))
     return found
 
 
@@ -168,7 +171,9 @@ def trace(task: Task) -> None:
     renderer = SpectralRenderer(
         task.design.sensor(), count=task.design.light.bands, at=task.design.sensor, device="cpu"
     )
-    for field, path in zip(("pressure", "pressure_0"), _files(task), strict=False):
+    for field, path in zip(("pressure", "pressure_0"), _files(task), strict=True):
+        if _of(task, path):
+            continue
         seen = renderer.render(press.surface, field=field, seed=task.seed % 2**26)
         assert seen.traced is not None
         one = renderer.renderers[0]
@@ -197,8 +202,7 @@ def summary(light: tuple[TracedLight, ...], out: str) -> str:
 
 
 def _files(task: Task) -> list[Path]:
-    blank = task.place.with_name(task.place.name.removesuffix(".npz") + ".blank.npz")
-    return [task.place, blank] if task.blank else [task.place]
+    return [task.place, task.place.with_name(task.place.name.removesuffix(".npz") + ".blank.npz")]
 
 
 def _mark(task: Task) -> str:
@@ -211,8 +215,12 @@ def _mark(task: Task) -> str:
 
 
 def _kept(task: Task) -> bool:
+    return all(_of(task, path) for path in _files(task))
+
+
+def _of(task: Task, path: Path) -> bool:
     try:
-        return all(_read(path)[2] == _mark(task) for path in _files(task))
+        return _read(path)[2] == _mark(task)
     except (OSError, ValueError, KeyError):
         return False
 
