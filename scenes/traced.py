@@ -34,6 +34,7 @@ _STRESS = 3.0  # what inclusions change is so much of what presses change, times
 _FEWEST = 40  # presses
 _COARSE = 50  # cells per side on which modes are kept, and contact fraction is looked at
 _FINE = 100  # on which their mean is
+_NARROWEST = 1e-4  # of a kernel: less would be no number by the time it is squared
 _BEYOND = 2.0  # how far inputs may leave what was learned, times its reach
 FORMAT = "tsis-traced-4"
 LIGHT = 11
@@ -62,8 +63,8 @@ class TracedLight:
     kernel : (3,) what a `kriging.Kernel` is made of.
     mean : (n_led, layers, m, m), 1/mm².
     modes : (modes, n_led, layers, 50, 50), 1/mm²; at most 1, kept in half precision.
-    error_percent : root mean square over the presses, each left out in turn, of the error of the leading map,
-        all of it together, in per cent; the noise of what was traced is in it.
+    error_percent : root mean square over the presses, each pair left out in turn, of the error of the leading
+        map, all of it together, in per cent; the noise of what was traced is in it.
     """
 
     key: str
@@ -191,7 +192,7 @@ def learn(
     axes = np.concatenate([state, _principal(added - added @ state.T @ state, _ADDED)]).T / scale[:, None]
     flux = np.array([led.flux_W for led in sensor.leds])[:, None, None, None]
     mean, coarse = np.zeros(()), np.zeros((), np.float32)
-    for number, maps in enumerate(traced):
+    for number, maps in zip(range(n), traced, strict=True):
         # an LED that is dark in this band, its light being in another, stands in the way here all the same
         whole = np.asarray(maps, np.float64)
         per_watt = np.divide(whole, flux, out=np.zeros_like(whole), where=flux > 0.0)
@@ -208,9 +209,8 @@ def learn(
     missed = kriging.left_out(kernel, nodes, (total - total.mean())[:, None], noise)[:, 0] / total
     flat = coarse.reshape(n, -1)
     flat -= flat.mean(axis=0)
-    weigh = kriging.weights(
-        kernel, nodes, np.eye(n), noise
-    )  # the maps are many: weights of the presses, then theirs
+    # the maps are many: weights of the presses, then theirs
+    weigh = kriging.weights(kernel, nodes, np.eye(n), noise)
     smooth = kernel.terms(nodes, nodes) @ weigh
     told = np.concatenate([smooth[1::2], _STRESS * (smooth[::2] - smooth[1::2])]).astype(np.float32)
     values, vectors = np.linalg.eigh(np.asarray(told @ (flat @ flat.T) @ told.T, np.float64))
@@ -293,7 +293,7 @@ def assembled(arrays: Mapping[str, NDArray[np.generic]], key: str, error_percent
         axes.shape == (len(centre), k)
         and kernel.shape == (3,)
         and kernel[0] in range(1, k)
-        and (kernel[1:] > 0.0).all()
+        and (kernel[1:] > _NARROWEST).all()
         and nodes.shape == (len(nodes), k)
         and (np.abs(nodes).max(axis=0) > 0.0).all()
         and weights.shape == (1 + len(nodes), m)

@@ -103,9 +103,9 @@ def learn_light(
     tell("fit", 1.0)
     sensors = spectral.band_sensors(design.sensor(), count=design.light.bands, at=design.sensor)
     files = [path for task in tasks for path in _files(task)]
-    told = [_read(path)[0] for path in files]
+    told = [_array(path, "description") for path in files]
     light = tuple(
-        traced.learn(sensor, told, (_read(path)[1][number] for path in files))
+        traced.learn(sensor, told, (_array(path, f"traced.{number}") for path in files))
         for number, (_, _, sensor) in enumerate(sensors)
     )
     with staged_file(out, "out", ".npz") as place:
@@ -194,8 +194,8 @@ def trace(task: Task) -> None:
 def summary(light: tuple[TracedLight, ...], out: str) -> str:
     """Return what a person wants to know of learned light, several lines."""
     lines = [
-        f"traced light: {one.presses} presses, each left out in turn {one.error_percent:.2g} % off in all of "
-        "it, noise of the tracing included"
+        f"traced light: {one.presses} presses, each pair left out in turn {one.error_percent:.2g} % off in "
+        "all of it, noise of the tracing included"
         for one in light
     ]
     return "\n".join([*lines, f"file: {out}"])
@@ -236,6 +236,11 @@ def _read(path: Path) -> tuple[NDArray[np.float32], list[NDArray[np.float32]], s
     with np.load(path, allow_pickle=False) as file:
         bands = [file[f"traced.{number}"] for number in range(len(file.files) - 2)]
         return file["description"], bands, str(file["mark"])
+
+
+def _array(path: Path, name: str) -> NDArray[np.float32]:
+    with np.load(path, allow_pickle=False) as file:
+        return np.asarray(file[name])
 
 
 def _between(ends: tuple[float, float], share: float) -> float:
