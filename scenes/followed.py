@@ -176,6 +176,7 @@ def _lanes(
     number = dr.arange(mi.UInt32, n_led * each) // mi.UInt32(dr.opaque(mi.UInt32, each))
     if not paired:
         return number, recurrence.evenly(recurrence.side_by_side(each, n_led), start)
-    pairs = recurrence.side_by_side((each + 1) // 2, 1)
+    half = (each + 1) // 2
+    pairs = recurrence.side_by_side(half, n_led)
     within = dr.arange(mi.UInt32, n_led * each) - number * each
-    return number, recurrence.evenly(dr.gather(mi.UInt32, pairs, within >> 1), start)
+    return number, recurrence.evenly(dr.gather(mi.UInt32, pairs, number * half + (within >> 1)), start)

@@ -20,11 +20,14 @@ _RECURRENCE = tuple(int((1.1673039782614187 ** -(k + 1) % 1.0) * 2**32) | 1 for 
 
 
 def side_by_side(each: int, n_led: int) -> mi.UInt32:
-    """Indices 0 to `each`, for each LED, such that points of `evenly` that lie together follow each other.
+    """Indices of `each` points for each LED, such that points of `evenly` that lie together follow each other.
 
     Lanes that run together then meet the same faces and end together: a third less time for the same paths.
+    LEDs go on where the last one's points end. With the same points for all, LEDs that stand alike are off
+    alike, and their sum, which the camera sees, has up to twice the variance.
     """
-    return numbers(np.tile(_morton(each), n_led))
+    begins = np.arange(n_led, dtype=np.uint32) * np.uint32(each)
+    return numbers((begins[:, None] + _morton(each)).ravel())
 
 
 @lru_cache(maxsize=16)

@@ -37,3 +37,16 @@ def test_noise_percent_is_the_spread_of_seeds(variant: str, coupling: Literal["a
     )
     assert error < 0.08
     assert abs(claimed / spread - 1) < ALLOWED
+
+
+def test_leds_have_noise_of_their_own(variant: str) -> None:
+    """LEDs that stand alike are not off alike: the variance of their sum is that of all of them, no more."""
+    from scenes import Renderer
+
+    camera = {"columns": 96, "rows": 61, "pixel_um": (67.2, 78.4)}
+    renderer, press = Renderer(paper_sensor("air", **camera), "cpu"), bump()
+    runs = [renderer.render(press, quality="preview", seed=seed, samples=2**13) for seed in range(SEEDS)]
+    layers = np.array([run.radiance for run in runs], dtype=np.float64)
+    together, apart = layers.sum(axis=1).var(axis=0, ddof=1).mean(), layers.var(axis=0, ddof=1).sum(axis=0)
+    print(f"variance of the sum over the sum of variances: {together / apart.mean():.2f}")
+    assert together < 1.35 * apart.mean()
