@@ -173,10 +173,12 @@ def test_a_calibrated_model_is_kept_and_read(model, tmp_path):
     estimator = load_estimator(model)
     shape = estimator.features.shape
     noise = np.ones(shape, np.float32) * estimator.features.noise
+    flat = 1.0 + 0.1 * np.random.default_rng(1).random((shape[0], *shape[2:]), np.float32)
+    share = np.full(shape[0], 0.9, np.float32)
     sight = Sight(
         replace(estimator.features, noise=noise),
         estimator.error,
-        Discrepancy(2.0 * estimator.error, estimator.error),
+        Discrepancy(2.0 * estimator.error, estimator.error, flat, share),
     )
     place = tmp_path / "m.safetensors"
     save_estimator(replace(estimator, calibration=sight), emulator_of(model), place)
@@ -186,7 +188,11 @@ def test_a_calibrated_model_is_kept_and_read(model, tmp_path):
     assert np.allclose(again.off(inclusion), (2.0 + 3.0) * estimator.error)
     pictures = np.random.default_rng(0).random((2, *shape), np.float32)
     assert np.array_equal(again.features(pictures), estimator.features(pictures))
-    wrong = replace(sight, discrepancy=Discrepancy(estimator.error, np.eye(3)))
-    save_estimator(replace(estimator, calibration=wrong), emulator_of(model), place)
-    with pytest.raises(DesignError, match="do not fit"):
-        load_estimator(place)
+    plain = pictures[0, :, 1]
+    level = again.without(flat[:, None] * np.stack([plain + share[:, None, None], plain], axis=1))
+    assert np.allclose(level[:, 1], plain) and np.allclose(level[:, 0] - level[:, 1], 1.0, atol=1e-5)
+    for change in ({"tared": np.eye(3)}, {"flat": flat[:1]}, {"share": share[:1]}, {"flat": 0 * flat}):
+        wrong = replace(sight, discrepancy=replace(sight.discrepancy, **change))
+        save_estimator(replace(estimator, calibration=wrong), emulator_of(model), place)
+        with pytest.raises(DesignError, match="do not fit"):
+            load_estimator(place)

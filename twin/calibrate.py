@@ -24,7 +24,7 @@ from twin.assessing import Sample, levels_of, loaded, one_thread, opened, values
 from twin.chain import BLOCK, whole_blocks
 from twin.complaint import DesignError, shown
 from twin.corpus import Corpus
-from twin.discrepancy import shrunk, told_by
+from twin.discrepancy import alike, error_of, evened, told_by
 from twin.estimator import Estimator, Sight
 from twin.estimator_file import emulator_of, file_of, load_estimator, save_estimator, shares_of
 from twin.fitting import inside, reachable
@@ -130,20 +130,21 @@ def calibrated(estimator: Estimator, values: list[dict[str, float]], seen: Singl
     """Return the estimator that knows of differences between pictures of the corpus and what it renders, both
     (n, levels, 2, r, c) expected counts above black, for n specimens' values.
 
-    Fits look less where in the pictures these differences are: new features weigh each block by its noise and
-    by what it is off.
+    What they are off by every time is taken out of pictures. Fits look less where the rest is: new features
+    weigh each block by its noise and by what it is off.
     """
     chain, specimens = estimator.chain, _drawn(estimator)
     bright = Brightness.of(chain, specimens)
     many = pictures(chain, chain.inputs(specimens), bright)
     mapped = pictures(chain, chain.inputs(values), Brightness.of(chain, values))
     noise = mean_variance(chain.design, many, bright.gain, 1.0).mean(axis=0)
-    off = seen - own
+    flat, share = alike(seen, own)
+    level = evened(seen, flat, share)
+    off = level - own
     apart = np.stack([off[:, :, 0] - off[:, :, 1], off[:, :, 1]], axis=2)
     missed = gaussian_filter((apart**2).mean(axis=0), (0.0, 0.0, _NEAR, _NEAR))
     features = compress(many, np.sqrt(np.stack([noise.sum(axis=1), noise[:, 1]], axis=1) + missed))
-    rendered_, learned = (features(one).astype(np.float64) for one in (own, mapped))
-    sight = Sight(features, shrunk(rendered_ - learned), told_by(features, seen, own))
+    sight = Sight(features, error_of(features, mapped, own), told_by(features, level, own, flat, share))
     novelty = likeness_of(chain, chain.inputs(specimens), specimens, seen - mapped, 0)
     return replace(estimator, calibration=sight, novelty=novelty)
 

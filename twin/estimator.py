@@ -48,6 +48,14 @@ class Sight:
     error: NDArray[np.float64]
     discrepancy: Discrepancy | None = None
 
+    def without(self, pictures: Single) -> Single:
+        """Return pictures (levels, 2, r, c) without what they are off by every time."""
+        return pictures if self.discrepancy is None else self.discrepancy.without(pictures)
+
+    def told(self, pictures: Single) -> Single:
+        """Return features (k,) of pictures without that."""
+        return np.asarray(self.features(self.without(pictures)[None])[0])
+
     def off(self, pictures: NDArray[np.floating]) -> NDArray[np.float64] | float:
         """Return second moments (k, k) of what features of pictures (levels, 2, ...) are off by when they are
         rendered."""
@@ -109,7 +117,7 @@ class Estimator:
             method, answer = "rendered" if refined.renders else "fitted", refined.samples
         elif self.calibration is not None:
             method, answer = "unrendered", self.normal(fitted, samples, seed)
-        wanted = answer[:, : len(NAMES)]
+        wanted, seen = answer[:, : len(NAMES)], self.sight.without(seen)
         gain = np.array([self.chain.gain(self.prior.values(fitted.x[: len(self.prior.middle)]))])
         variance = mean_variance(self.chain.design, seen[None], gain, frames)[0]
         return Estimate(
@@ -134,9 +142,8 @@ class Estimator:
         if self.calibration is None:
             return float(self.network.present(self.features(seen[None]), frames)[0])
         sight, fitted = self.sight, self.fitted(seen, frames, start)
-        told = sight.features(seen[None])[0]
         off = sight.error + sight.off(fitted.pictures)
-        return presence(self.chain, sight.features, self.prior, told, frames, fitted, off)
+        return presence(self.chain, sight.features, self.prior, sight.told(seen), frames, fitted, off)
 
     def normal(self, fitted: Fitted, samples: int, seed: int) -> NDArray[np.float64]:
         """Samples (n, 5) about the most probable specimen, within the prior's ranges. What the noise does not
@@ -180,7 +187,7 @@ class Estimator:
                 sight.features,
                 prior,
                 sight.error,
-                sight.features(seen[None])[0],
+                sight.told(seen),
                 frames,
                 np.concatenate([start, np.zeros(prior.basis.shape[1])]),
                 pictures,
@@ -200,7 +207,7 @@ class Estimator:
         back; blocks that it has not seen are those that are expected."""
         sight = self.sight
         error = sight.error + sight.off(self.coarse(received))
-        parts = (self.chain, sight.features, error, self.coarse)
+        parts = (self.chain, sight.features, error, lambda one: sight.without(self.coarse(one)))
         matrix = where(*parts, self.prior.of_another_camera(self._pattern), received, start)
         now, blocks = put_back(received, matrix)
         back, prior = self.coarse(now), self.prior.of_another_camera(self._pattern, _LEFT_PERCENT)
@@ -232,8 +239,8 @@ class Estimator:
         (5,)."""
         x = np.concatenate([start, np.zeros(self.prior.basis.shape[1])])
         sight = self.sight
-        told, error = sight.features(seen[None])[0], sight.error + sight.off(seen)
-        return fit(self.chain, sight.features, self.prior, told, frames, x, error)
+        error = sight.error + sight.off(seen)
+        return fit(self.chain, sight.features, self.prior, sight.told(seen), frames, x, error)
 
 
 def black(chain: Chain) -> float:

@@ -38,6 +38,8 @@ from twin.fitting import Prior
 
 FORMAT = "tsis-estimator-3"
 _FEATURES = ("mean", "axes", "noise", "spread")
+_OFF = tuple(field.name for field in fields(Discrepancy))
+_LEAST_FLAT = 0.1  # pictures are divided by it
 _CARD_BYTES = 4 * 2**20
 _NEEDED = {
     "design": dict,
@@ -211,9 +213,13 @@ def _assembled(card: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Estimat
     sight = None
     if "sight.error" in arrays:
         own = _features(arrays, "sight", features.shape)
-        error, off = arrays["sight.error"], Discrepancy(arrays["sight.common"], arrays["sight.tared"])
+        error, off = arrays["sight.error"], Discrepancy(*(arrays[f"sight.{name}"] for name in _OFF))
         if any(one.shape != (len(own.spread),) * 2 for one in (error, off.common, off.tared)):
             raise ValueError("shapes")
+        if off.flat.shape != (levels, rows, columns) or off.share.shape != (levels,):
+            raise ValueError("shapes")
+        if min(off.flat.min(), off.share.min()) < _LEAST_FLAT:
+            raise ValueError("sight.flat, sight.share")
         sight = Sight(own, error, off)
     prior = Prior(
         arrays["prior.ranges"],
