@@ -4,6 +4,7 @@ Pictures of 96 x 61 pixels, each 8 x 8 of the paper's camera: all that is compar
 Sensors and presses are alike in their four quarters, so pictures are folded, which halves their noise.
 Standard pictures are noisy, too: 0.6 % in a millimetre at the rim. A case takes 40 minutes of a core, 80
 with full contact.
+With TWIN_FIRST=3001 the reference follows other paths than those of seeds 2001 and on.
 What `assets/light_bias.json` tells frames is measured here: `--write-bias` writes it, else it is compared.
 """
 
@@ -11,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -35,6 +37,8 @@ CASES = {
 }
 PASSES, PATHS = 48, 2**20
 """Reference pictures and their light paths per LED."""
+FIRST = int(os.environ.get("TWIN_FIRST", "2001"))
+"""Seed of the first."""
 
 SEEDS = 48
 """Pictures of the gathered qualities."""
@@ -55,7 +59,7 @@ def pictures(
     name: str, passes: int = PASSES, paths: int = PATHS, seeds: int = SEEDS
 ) -> tuple[np.ndarray, np.ndarray]:
     """Standard and reference pictures (seeds or passes, 31, 48)."""
-    return gathered(name, "standard", seeds), _pictures(name, "reference", range(2001, 2001 + passes), paths)
+    return gathered(name, "standard", seeds), _pictures(name, "reference", range(FIRST, FIRST + passes), paths)
 
 
 @cache
