@@ -20,7 +20,7 @@ _RECURRENCE = tuple(int((1.1673039782614187 ** -(k + 1) % 1.0) * 2**32) | 1 for 
 
 
 def side_by_side(each: int, n_led: int) -> mi.UInt32:
-    """Indices of `each` points for each LED, such that points of `evenly` that lie together follow each other.
+    """Indices of points of `evenly`, `each` for every LED, in an order in which neighbours follow each other.
 
     Lanes that run together then meet the same faces and end together: a third less time for the same paths.
     LEDs go on where the last one's points end. With the same points for all, LEDs that stand alike are off

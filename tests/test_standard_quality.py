@@ -59,7 +59,8 @@ def pictures(
     name: str, passes: int = PASSES, paths: int = PATHS, seeds: int = SEEDS
 ) -> tuple[np.ndarray, np.ndarray]:
     """Standard and reference pictures (seeds or passes, 31, 48)."""
-    return gathered(name, "standard", seeds), _pictures(name, "reference", range(FIRST, FIRST + passes), paths)
+    followed = range(FIRST, FIRST + passes)
+    return gathered(name, "standard", seeds), _pictures(name, "reference", followed, paths)
 
 
 @cache
