@@ -39,6 +39,7 @@ from twin.fitting import Prior
 FORMAT = "tsis-estimator-3"
 _FEATURES = ("mean", "axes", "noise", "spread")
 _OFF = tuple(field.name for field in fields(Discrepancy))
+_MADE = "those of this version's `twin train` and `twin calibrate`"
 _LEAST_FLAT = 0.1  # pictures are divided by it
 _CARD_BYTES = 4 * 2**20
 _NEEDED = {
@@ -173,9 +174,7 @@ def load_estimator(path: str | Path) -> Estimator:
         safetensors.SafetensorError,
     ) as error:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise DesignError(
-            "MODEL", f"files that do not fit ({reason})", "those of `twin train`", source=name
-        ) from None
+        raise DesignError("MODEL", f"files that do not fit ({reason})", _MADE, source=name) from None
 
 
 def _card(place: Path) -> dict[str, Any]:
