@@ -126,7 +126,7 @@ def smooth(features: Features, both: Floats, alone: Floats, length: float) -> Fl
     Parameters
     ----------
     both, alone : (levels,) their standard deviations, counts.
-    length : of their Matérn covariance of order 5/2, blocks.
+    length : of their covariance, a product of Matérn's of order 5/2 down and along, blocks.
     """
     levels, _, rows, columns = features.shape
     down, along = (
