@@ -183,23 +183,25 @@ def fit(plan: Plan, folder: str | Path, samples: int | None = None) -> Emulator:
     solves[: len(kinds)] = [tally(place, *kind) for kind in kinds]
     with one_thread():
         fits = _fit(known, None)
-        gains = [_finer(pairs) for pairs in (known.pairs, known.pairs_more) if pairs is not None]
+        gains = [_gain(pairs) for pairs in (known.pairs, known.pairs_more) if pairs is not None]
         errors = _cross_validated(known, fits, gains, solves)
-    base = known.base
-    rise, tared = fits.samples
-    rise_more, tared_more = (None, None) if fits.more is None else fits.more
-    finer, finer_more = gains[0], gains[1] if plan.finite else None
-    parts = rise, tared, finer, rise_more, tared_more, finer_more
-    return Emulator(plan, base.x, base.pressure, base.moved, *parts, errors)
+    base, (rise, tared), (finer, finer_tared) = known.base, fits.samples, gains[0]
+    parts = plan, base.x, base.pressure, base.moved, rise, tared, finer, finer_tared
+    if fits.more is None:
+        return Emulator(*parts, None, None, None, None, errors)
+    (rise_more, tared_more), (finer_more, finer_tared_more) = fits.more, gains[1]
+    return Emulator(*parts, rise_more, tared_more, finer_more, finer_tared_more, errors)
 
 
-def _finer(pairs: _Samples, known: Regression | None = None) -> Regression:
-    """What a finer mesh adds; with lengths and noise of another regression, or None to find them."""
+def _gain(pairs: _Samples, known: Pair | None = None) -> Pair:
+    """What a finer mesh adds to rise and tared displacement; with lengths and noise of other regressions, or
+    None to find them."""
     inputs = pairs.inputs[:, [k for k in CENTRED if k < pairs.inputs.shape[1]]]
-    return regress(inputs, _flat(pairs.rise), None if known is None else (known.lengths, known.noise))
+    first, second = (None, None) if known is None else ((one.lengths, one.noise) for one in known)
+    return regress(inputs, _flat(pairs.rise), first), regress(inputs, _flat(pairs.tared), second)
 
 
-def _cross_validated(known: _Known, fits: _Fits, gains: list[Regression], solves: Floats) -> Errors:
+def _cross_validated(known: _Known, fits: _Fits, gains: list[Pair], solves: Floats) -> Errors:
     """Errors of samples that are left out, some at a time, from fits with the same lengths."""
     last, found = known.last, np.empty((len(known.last.points), 6))
     for k in range(_FOLDS):
@@ -211,31 +213,34 @@ def _cross_validated(known: _Known, fits: _Fits, gains: list[Regression], solves
         found[fold] = _errors(known, _fit(known.without(held), fits.lengths), last.number[fold])
     inside = last.typical & np.isfinite(found).all(axis=1)
     finer = _finer_errors(known, fits, known.pairs, gains[0])
-    more = np.empty((0, 3))
+    more = np.empty((0, 6))
     if known.pairs_more is not None:
         more = _finer_errors(known, fits, known.pairs_more, gains[1])
     fields = found[inside, :3], found[inside, 3:], finer, more
     return Errors(last.points[inside, 0], *fields, _curve(known), solves)
 
 
-def _finer_errors(known: _Known, fits: _Fits, pairs: _Samples, gain: Regression) -> Floats:
-    """Errors (n, 3) of what a finer mesh adds, of each pair left out, over the tared pressure at small
-    strain, as `_missed`."""
-    plan, x, found = known.samples.plan, known.base.x, np.empty((len(pairs.points), 3))
+def _finer_errors(known: _Known, fits: _Fits, pairs: _Samples, gains: Pair) -> Floats:
+    """Errors (n, 6) of what a finer mesh adds, of each pair left out, over the tared pressure at small
+    strain, then over the tared displacement, as `_missed`."""
+    plan, x, found = known.samples.plan, known.base.x, np.empty((len(pairs.points), 6))
+    lean = replace(pairs, res=plan.resolution)
     for i in range(len(pairs.points)):
         fold = np.arange(len(pairs.points)) == i
-        guess = _finer(pairs.part(~fold), gain)(gain.inputs[i : i + 1]).reshape(pairs.rise[i].shape)
-        miss = pairs.on_grid(i, "rise", guess - pairs.rise[i], x)
-        n = known.samples.rise.shape[-1]
-        whole = fits.samples[0](features(plan, pairs.points[i : i + 1])[:, :-1]).reshape(-1, n, n)
+        guesses = _gain(pairs.part(~fold), gains)
+        inputs = features(plan, pairs.points[i : i + 1])[:, :-1]
         unit = known.base.unit(plan, pairs.points[i])
-        if pairs is known.pairs_more:
-            along = lagrange(contrast(plan.ratios), float(pairs.points[i, 6]))
-            whole, unit = np.tensordot(along, whole, 1)[None], unit[1:]
-        else:
-            unit = unit[:1]
-        true = replace(pairs, res=plan.resolution).on_grid(i, "rise", whole, x)
-        found[i] = _missed(miss * unit, true * unit, x)
+        unit = unit[1:] if pairs is known.pairs_more else unit[:1]
+        for k, kind in enumerate(("rise", "tared")):
+            added = getattr(pairs, kind)[i]
+            guess = guesses[k](gains[k].inputs[i : i + 1]).reshape(added.shape)
+            whole = fits.samples[k](inputs).reshape(-1, *getattr(known.samples, kind).shape[2:])
+            if pairs is known.pairs_more:
+                along = lagrange(contrast(plan.ratios), float(pairs.points[i, 6]))
+                whole = np.tensordot(along, whole, 1)[None]
+            scale = unit if kind == "rise" else 1.0
+            miss, true = pairs.on_grid(i, kind, guess - added, x), lean.on_grid(i, kind, whole, x)
+            found[i, 3 * k : 3 * k + 3] = _missed(miss * scale, true * scale, x)
     return found
 
 
@@ -251,9 +256,8 @@ def _read(plan: Plan, folder: Path, kind: str, first: int | None) -> _Samples:
         points[:, 2:4] = 0.0
     s = points[:, 6:] if finite else contrast(plan.ratios)
     scales = amplitudes(points[:, None], s)  # each (n, cases or 1)
-    none = np.zeros((*found[0]["rise"].shape, 0))  # pairs have no displacements
     rise = np.stack([f["rise"] for f in found]) / scales[0][..., None, None]
-    tared = np.stack([f.get("moved", none) for f in found]) / scales[1][..., None, None, None]
+    tared = np.stack([f["moved"] for f in found]) / scales[1][..., None, None, None]
     seconds = np.array([float(f["seconds"]) for f in found])
     number = np.array([int(f["number"]) for f in found])
     inputs = features(plan, points)

@@ -80,10 +80,10 @@ class Emulator:
         ...).
     rise, tared
         What the inclusion adds, as `sampling.solve` gives it, over `amplitudes`.
-    finer
-        What a finer mesh adds to the rise, as `sampling.refine` gives it, over `amplitudes`.
-    rise_more, tared_more, finer_more
-        What finite strain adds, as `sampling.stretch` gives it, and what the finer mesh adds to its rise, as
+    finer, finer_tared
+        What a finer mesh adds to both, as `sampling.refine` gives it, over `amplitudes`.
+    rise_more, tared_more, finer_more, finer_tared_more
+        What finite strain adds, as `sampling.stretch` gives it, and what the finer mesh adds to that, as
         `sampling.refine_stretch` does, over `amplitudes`; None for a linear one.
     errors
         From cross-validation.
@@ -96,9 +96,11 @@ class Emulator:
     rise: Regression
     tared: Regression
     finer: Regression
+    finer_tared: Regression
     rise_more: Regression | None
     tared_more: Regression | None
     finer_more: Regression | None
+    finer_tared_more: Regression | None
     errors: Errors
 
     def __call__(
@@ -237,14 +239,12 @@ def _pressed(
 
 @dataclass(frozen=True)
 class _Learned:
-    """What the regressions say of a specimen: flat fields on a mesh for each ratio of moduli, and what finite
-    strain adds for each level."""
+    """What the regressions say of a specimen, flat fields on a mesh: rise, tared displacement and what a
+    finer mesh adds to each, for each ratio of moduli; and what finite strain adds, for each level."""
 
     point: Floats
-    rise: Floats
-    tared: Floats
-    finer: Floats
-    more: tuple[Floats, Floats, Floats] | None
+    first: tuple[Floats, Floats, Floats, Floats]
+    more: tuple[Floats, Floats, Floats, Floats] | None
 
 
 def _learned(emulator: Emulator, specimens: Sequence[tuple[Slab, Inclusion]]) -> list[_Learned]:
@@ -266,16 +266,19 @@ def _learned(emulator: Emulator, specimens: Sequence[tuple[Slab, Inclusion]]) ->
     centred = inputs[first][:, CENTRED]  # of no image: it is symmetric
     ratios, levels = len(plan.ratios), len(plan.levels) - 1
     small = _blended(seen, emulator.rise(linear), emulator.tared(linear), ratios)
-    finer = emulator.finer(centred[:, :-1]).reshape(len(first), ratios, -1)
+    gains = emulator.finer, emulator.finer_tared
+    finer = [gain(centred[:, :-1]).reshape(len(first), ratios, -1) for gain in gains]
     found = [
-        _Learned(point, rise, tared, gain, None)
-        for point, (rise, tared), gain in zip(rows[first], small, finer, strict=True)
+        _Learned(point, (*two, *gain), None)
+        for point, two, *gain in zip(rows[first], small, *finer, strict=True)
     ]
-    if emulator.rise_more is None or emulator.tared_more is None or emulator.finer_more is None:
+    if not emulator.plan.finite:
         return found
+    assert emulator.rise_more and emulator.tared_more and emulator.finer_more and emulator.finer_tared_more
     more = _blended(seen, emulator.rise_more(inputs), emulator.tared_more(inputs), levels)
-    finer = emulator.finer_more(centred).reshape(len(first), levels, -1)
-    return [replace(one, more=(*two, gain)) for one, two, gain in zip(found, more, finer, strict=True)]
+    gains = emulator.finer_more, emulator.finer_tared_more
+    finer = [gain(centred).reshape(len(first), levels, -1) for gain in gains]
+    return [replace(one, more=(*two, *gain)) for one, two, *gain in zip(found, more, *finer, strict=True)]
 
 
 def _blended(
@@ -305,13 +308,12 @@ def signals(
     along = lagrange(contrast(plan.ratios), s)
     lean, fine = (resample(geometry, res, emulator.x) for res in (plan.resolution, plan.fine))
     coarse = lean if learned.more is None else resample(geometry, plan.coarse, emulator.x)
-    first = _on_grid(lean, along @ learned.rise, along @ learned.tared, fine, along @ learned.finer)
+    first = _on_grid(lean, fine, *(along @ part for part in learned.first))
     scales, found = amplitudes(learned.point, s), []
     for level in levels:
         parts = [first]
         if learned.more is not None:
-            rise, tared, finer = (level[1:] @ more for more in learned.more)
-            parts.append(_on_grid(coarse, rise, tared, fine, finer))
+            parts.append(_on_grid(coarse, fine, *(level[1:] @ part for part in learned.more)))
         whole = (sum(part) for part in zip(*parts, strict=True))
         rise, tared = (scale * part for scale, part in zip(scales, whole, strict=True))
         found.append((rise, tared))
@@ -319,12 +321,20 @@ def signals(
 
 
 def _on_grid(
-    onto: tuple[Floats, Floats], rise: Floats, tared: Floats, fine: tuple[Floats, Floats], finer: Floats
+    onto: tuple[Floats, Floats],
+    fine: tuple[Floats, Floats],
+    rise: Floats,
+    tared: Floats,
+    finer: Floats,
+    finer_tared: Floats,
 ) -> tuple[Floats, Floats]:
     """Carry fields from a mesh's nodes, flat, to the grid, (m, m) and (m, m, 3), and what a finer mesh adds
-    to the first one from its nodes; see `resample`."""
-    whole = _carried(onto, rise) + _carried(fine, finer)
-    return whole, np.stack([_carried(onto, moved) for moved in tared.reshape(-1, 3).T], axis=-1)
+    to each from its nodes; see `resample`."""
+    moved = [
+        _carried(onto, less) + _carried(fine, more)
+        for less, more in zip(tared.reshape(-1, 3).T, finer_tared.reshape(-1, 3).T, strict=True)
+    ]
+    return _carried(onto, rise) + _carried(fine, finer), np.stack(moved, axis=-1)
 
 
 def _carried(onto: tuple[Floats, Floats], values: Floats) -> Floats:

@@ -23,10 +23,10 @@ from fem.solving import KNOTS
 
 Floats = NDArray[np.float64]
 
-_FORMAT = 6
+_FORMAT = 7
 _LARGEST = 512 * 2**20  # bytes of all arrays
-_REGRESSIONS = ("rise", "tared", "finer")
-_MORE = ("rise_more", "tared_more", "finer_more")  # that finite strain has besides
+_REGRESSIONS = ("rise", "tared", "finer", "finer_tared")
+_MORE = ("rise_more", "tared_more", "finer_more", "finer_tared_more")  # that finite strain has besides
 _GRIDS = ("x", "pressure", "moved")
 
 
@@ -128,14 +128,14 @@ def _checked(arrays: dict[str, NDArray[Any]]) -> Emulator:
         finite, finer = name in _MORE, name.startswith("finer")
         q = (5 if finer else 7) + finite
         values = (levels - 1 if finite else moduli) * (fine if finer else coarse if finite else lean)
-        shapes |= _shapes_of(arrays, name, q, values * (3 if name.startswith("tared") else 1))
+        shapes |= _shapes_of(arrays, name, q, values * (3 if "tared" in name else 1))
     points, *pairs, rows = (len(arrays[f"errors.{k}"]) for k in ("size_mm", "finer", "finer_more", "curve"))
     shapes |= {
         "errors.size_mm": (points,),
         "errors.pressure": (points, 3),
         "errors.displacement": (points, 3),
     }
-    shapes |= {"errors.finer": (pairs[0], 3), "errors.finer_more": (pairs[1], 3)}
+    shapes |= {"errors.finer": (pairs[0], 6), "errors.finer_more": (pairs[1], 6)}
     shapes |= {"errors.curve": (rows, 9), "errors.solves": (4, 2)}
     for name, shape in shapes.items():
         if arrays[name].shape != shape:

@@ -260,12 +260,13 @@ def solve(plan: Plan, point: Floats) -> dict[str, Floats]:
 
 
 def refine(plan: Plan, point: Floats) -> dict[str, Floats]:
-    """What the finer mesh adds to the rise under the probe's middle, where symmetry makes it cheap.
+    """What the finer mesh adds under the probe's middle, where symmetry makes it cheap.
 
     Returns
     -------
-    `rise` (moduli, k, k) as of `solve`, at the fine mesh's nodes, less what is carried there from the lean
-    one's: what cubic splines through so few nodes are off by, three times what the solves are, is in it.
+    `rise` (moduli, k, k) and `moved` (moduli, k, k, 3) as of `solve`, at the fine mesh's nodes, less what is
+    carried there from the lean one's: what cubic splines through so few nodes are off by, three times what
+    the solves are, is in it.
     """
     point = _centred(point)
     meshes = plan.resolution, plan.fine
@@ -303,7 +304,7 @@ def refine_stretch(plan: Plan, point: Floats) -> dict[str, Floats]:
 
     Returns
     -------
-    `rise` (levels, k, k) as of `stretch`, at the fine mesh's nodes.
+    `rise` (levels, k, k) and `moved` (levels, k, k, 3) as of `stretch`, at the fine mesh's nodes.
     """
     point = _centred(point)
     meshes = plan.coarse, plan.fine
@@ -317,11 +318,16 @@ def _centred(point: Floats) -> Floats:
 def _gain(
     plan: Plan, point: Floats, meshes: tuple[Resolution, Resolution], found: list[dict[str, Floats]]
 ) -> dict[str, Floats]:
-    """Rise of the second mesh at its nodes, less that of the first one carried there."""
+    """Fields of the second mesh at its nodes, less those of the first one carried there."""
     geometry = geometry_at(plan, point, 1.0)
     nodes = [lines(geometry, res)[0] for res in meshes]
-    onto, (less, more) = cubic(*nodes), (each["rise"] for each in found)
-    return {"rise": more - np.einsum("ai,cij,bj->cab", onto, less, onto, optimize=True)}
+    onto, (less, more) = cubic(*nodes), found
+
+    def gain(name: str) -> Floats:
+        carried = np.einsum("ai,cij...,bj->cab...", onto, less[name], onto, optimize=True)
+        return np.asarray(more[name] - carried)
+
+    return {name: gain(name) for name in ("rise", "moved")}
 
 
 def _tared(geometry: Geometry, full: Path, bare: Path, level: float) -> tuple[Floats, Floats]:

@@ -87,14 +87,19 @@ def test_the_shipped_emulator_against_full_solves(ball, mean, worst):
     solved = presses.solved(design, ball, levels, quality="standard", pictured=True)
     for level, guess, press in zip(levels, guessed, solved, strict=True):
         assert np.allclose(guess.surface.points, press.surface.points)
-        (true, plain), (found, bare) = (
-            (one.surface["pressure"], one.surface["pressure_0"]) for one in (press, guess)
-        )
         inner = off_the_edge(np.unique(press.surface.points[:, 0])).ravel()
-        miss, top = ((found - bare) - (true - plain))[inner], np.abs(true - plain)[inner].max()
-        percent = 100 * np.sqrt((miss**2).mean()) / top, 100 * np.abs(miss).max() / top
-        print(f"{ball}, {level} mm: tared pressure {percent[0]:.2f} % rms, {percent[1]:.2f} % at worst")
-        assert percent[0] < mean and percent[1] < worst
+        for name in ("pressure", "displacement"):
+            true, found = (tared(one.surface, name)[inner] for one in (press, guess))
+            miss, top = found - true, np.abs(true).max()
+            percent = 100 * np.sqrt((miss**2).mean()) / top, 100 * np.abs(miss).max() / top
+            print(f"{ball}, {level} mm: tared {name} {percent[0]:.2f} % rms, {percent[1]:.2f} % at worst")
+            assert percent[0] < mean and percent[1] < worst
+
+
+def tared(surface: Any, name: str) -> np.ndarray:
+    """What the inclusion changes in the pressure, or in the displacement into the probe, (n,)."""
+    change = surface[name] - surface[f"{name}_0"]
+    return change if change.ndim == 1 else change[:, 2]
 
 
 @pytest.mark.slow

@@ -54,16 +54,16 @@ def invented(mechanics: str = "linear") -> Emulator:
     bump = np.exp(-(np.linspace(-3, 3, n) ** 2))
     bump = 0.09 * np.multiply.outer(bump, bump)
     into = bump[..., None] * [0.0, 0.0, -0.1]
-    more = [None, None, None]
+    more = [None, None, None, None]
     if plan.finite:
-        parts = (bump, 8), (into, 8), (0 * bump, 6)
+        parts = (bump, 8), (into, 8), (0 * bump, 6), (0 * into, 6)
         more = [constant(np.stack([0.1 * k * b for k in (1, 2, 3)]), inputs) for b, inputs in parts]
     errors = Errors(
         np.full(20, 8.0),
         np.ones((20, 3)),
         np.full((20, 3), 1.5),
-        np.ones((16, 3)),
-        np.ones((16 if plan.finite else 0, 3)),
+        np.ones((16, 6)),
+        np.ones((16 if plan.finite else 0, 6)),
         np.zeros((0, 9)),
         np.zeros((4, 2)),
     )
@@ -76,6 +76,7 @@ def invented(mechanics: str = "linear") -> Emulator:
         constant(known[0], 7),
         constant(known[1], 7),
         constant(0 * known[0], 5),
+        constant(0 * known[1], 5),
         *more,
         errors,
     )

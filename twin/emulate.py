@@ -123,8 +123,9 @@ def summary(emulator: fem.Emulator, out: str) -> str:
         lines += _errors(errors, "smaller ones", smallest)
     for what, found in (("", errors.finer), (", what finite strain adds", errors.finer_more)):
         if len(found):
-            typical, bad = (percent_in_words(float(np.percentile(found[:, 0], p))) for p in (50, 95))
-            lines.append(f"what the standard mesh adds to tared pressure{what}: off by {typical} and {bad}")
+            for name, column in (("pressure", 0), ("displacement", 3)):
+                typical, bad = (percent_in_words(float(np.percentile(found[:, column], p))) for p in (50, 95))
+                lines.append(f"what the standard mesh adds to tared {name}{what}: off by {typical} and {bad}")
     for count, more, seconds, median, bad, *_ in errors.curve:
         solves = f"{count:.0f} samples" + (f" ({more:.0f} at finite strain)" if more else "")
         lines.append(

@@ -40,8 +40,8 @@ COARSEST = Resolution(2, 1, 2, 2, 1, 1, 1, 1, 1)
 CHEAPEST = Resolution(3, 1, 3, 2, 1, 1, 1, 1, 1)
 """The least cells of ours that reach ERROR_PERCENT, with (4, 6, 60) as with (10, 5, 100)."""
 
-SHARED_SAMPLES, SHARED_ERROR_PERCENT = 96, 2.5
-"""Samples of an emulator; what its tared maximum may be off by, for its displacement is a lean mesh's."""
+SHARED_SAMPLES = 96
+"""Samples of an emulator."""
 
 OTHERS = (fem.Inclusion(6, 4.5, 60), fem.Inclusion(12, 7, 40), fem.Inclusion(8, 6, 110))
 
@@ -215,8 +215,7 @@ def test_linear_at_equal_error(ladders: dict[str, list[Run]], expected: float) -
 @pytest.mark.timeout(3600)
 def test_linear_where_samples_share(ladders: dict[str, list[Run]], expected: float, tmp_path: Path) -> None:
     """A press of a sensor that was learned once: what all its specimens share is not solved again. Its error
-    is the worst of four inclusions that no sample has: more than ERROR_PERCENT, at which the peers' times
-    are told."""
+    is the worst of four inclusions that no sample has, and may be that at which the peers' times are told."""
     plan = plan_of(replace(load_design("tsis"), mechanics="linear"))
     start = time.perf_counter()
     built = build_emulator(plan, tmp_path, samples=SHARED_SAMPLES)
@@ -242,7 +241,7 @@ def test_linear_where_samples_share(ladders: dict[str, list[Run]], expected: flo
             print(f"  {name}: {theirs:.2f} s, ratio {theirs / each:.0f} (goal {PEER_GOAL:.0f}){word}")
             print(f"    sooner with the building, too, from {once / (theirs - each):.0f} presses on")
             assert theirs / each >= PEER_GOAL
-    assert worst <= SHARED_ERROR_PERCENT
+    assert worst <= ERROR_PERCENT
 
 
 @pytest.mark.slow
