@@ -146,7 +146,7 @@ def tasks_of(
             (away * (2 * float(unit[3]) - 1), away * (2 * float(unit[4]) - 1)),
         )
         low, high = ranges.indentation_mm
-        low = max(low, 0.2 * high)
+        low = max(low, 0.2 * high)  # well below the first level that is usual: the end is told worst
         if len(found) >= round((1.0 - _DEEP) * samples):
             low = high - _DEEPEST * (high - low)
         depth = _between((low, high), unit[5])
