@@ -30,7 +30,7 @@ _DEAD = (
     "holds (what is solved is kept: the same call goes on)"
 )
 _FORMAT = 6  # of the files in a folder
-_SHARES = {"pair": 8, "stretched_pair": 16}  # samples for each pair of a fine and a lean or coarse mesh
+_SHARE = 8  # samples for each pair of a fine and a lean or coarse mesh
 STRETCHED = 3  # samples for each one at finite strain, which is the same specimen as an earlier one
 _FIRST = 16  # pairs of each kind that come with one sample each
 KNOTS = (4, 4)  # Chebyshev nodes of the background along thickness and tissue: 0.01 % off between them
@@ -124,13 +124,12 @@ def _tasks(plan: Plan, folder: Path, samples: int | None) -> Iterator[tuple[str,
     """What is still to solve, in order; pairs are spread evenly among the samples."""
 
     def order() -> Iterator[tuple[str, int]]:
-        shares = _SHARES if plan.finite else {"pair": _SHARES["pair"]}
-        pairs = dict.fromkeys(shares, 0)
+        pairs = dict.fromkeys(("pair", "stretched_pair") if plan.finite else ("pair",), 0)
         for number in range(KNOTS[0] * KNOTS[1]):
             yield "background", number
         for number in count() if samples is None else range(samples):
-            for kind, share in shares.items():
-                while pairs[kind] <= max(min(number, _FIRST - 1), number // share):
+            for kind in pairs:
+                while pairs[kind] <= max(min(number, _FIRST - 1), number // _SHARE):
                     yield kind, pairs[kind]
                     pairs[kind] += 1
             yield "sample", number

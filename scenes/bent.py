@@ -1,18 +1,18 @@
 """What tissue gives back under a bent contact, over what it gives back under a flat one.
 
-Under a face that bulges into it there is more tissue for each area of the face the deeper one looks, by
-1 + H z with H the sum of both curvatures (Weyl 1939; key weyl1939). Diffuse light that falls as exp(-λ z)
-under a flat face then falls as exp(-(λ + H/2) z), to first order: φ'' + H φ' - λ² φ = 0. Its decay also grows
-with the lateral wave number, λ² = λ0² + k² (`slab`), so that the flat reflectance tells what a faster decay
-costs: d ln R / dλ = (λ/k) d ln R / dk. Light that the face throws back comes again: R / (1 - w R) for R.
+To first order in the face's heights h, how light that enters with the lateral wave vector k and comes up with
+p is changed by the domain's perturbation (Hadamard 1908; key hadamard1908). For light that diffuses,
+φ ~ exp(-λ z) with λ² = λ0² + k² (`slab`), that is h(p - k) A_p A_k (λ0² + p·k - λ_p λ_k): what is absorbed
+and what spreads in the layer by which the face is moved, less what moving it changes by the field's fall with
+depth. As maps, of light E that enters, u = A E,
 
-Curvature that changes from place to place tells less: a crest is also where light has not yet spread out. By
-walks under waves it tells half at a wave number k½ with k½² = 0.06 + 0.45 λ0², per transport mean free path,
-and nothing at 1.6 times that (`tests/test_bent.py`); a Gaussian stands for it.
+    δV = A [λ0² h u - ∇·(h ∇u) - Λ (h Λ u)],    Λ: times λ of the wave number.
 
-All this is the change of all the light that one spot gives back, and by reciprocity of what comes back there
-of light all over. Half of it is due where light goes in and half where it comes out: a factor 1 + γ at either
-end, with γ (1 + G / G(0)) that change, G the reflectance with what is thrown back.
+A² is what a faster decay costs, -dG/dλ, told by the flat reflectance, in which λ and k go together:
+(1 + 0.28 λ0 + 0.41 λ0²) (-(λ/k) dR/dk) / (1 - w R)², with w what the face throws back. The first bracket, λ0
+per transport mean free path, is for absorption so strong that light hardly diffuses, by walks
+(`tests/test_bent.py`). A face moved or tilted as a whole changes nothing, and one bent evenly A²/2 times the
+sum of its curvatures.
 
 All else of standard light has tissue flat; the reference (`wander`) walks under the surface as it is.
 """
@@ -30,52 +30,139 @@ from .tissue import TissueOptics
 Array = NDArray[np.float64]
 
 _NODES = 160  # wave numbers at which the flat reflectance is worked out
-_LEAST, _MOST = 1e-3, 1e3  # of them, per transport mean free path
-_EVEN = np.array([0.045, 0.055])  # wave numbers that stand for even curvature
+_LEAST, _MOST = 1e-2, 1e3  # of them, per transport mean free path
+_STRONG = (0.41, 0.28, 1.0)  # over λ0, highest power first
+_SHARP = 0.3  # of the finest wave: finer ones fade from A, or products of two would come back as others
+_FAINT = 1e-9  # of the brightest light: where there is less, nothing is changed
+_AT_MOST = 0.5  # a first order is not to be believed beyond
 
 
 @dataclass(frozen=True)
 class Bent:
-    """The answer to curvature of one tissue, on square cells over the guide's face; make it with `bent`.
+    """One tissue on square cells over the guide's face and a margin beside it; make it with `bent`.
 
     Attributes
     ----------
-    reflectance, answer : (m, m)
-        R, and d ln R / dλ as far as curvature tells, mm, at the wave numbers of cosines over the face.
-    cell_mm
-        Side of a cell.
+    reflectance, strength : (m, m // 2 + 1)
+        R, and A² of a face that throws nothing back, mm, at the wave vectors of real Fourier transforms over
+        the cells and those that keep the maps `apart` from their own repetition.
+    decay : (m, m // 2 + 1)
+        λ, 1/mm.
+    waves : (m // 2 + 1,) and (m, 1)
+        Along x and y, 1/mm.
+    slowest_per_mm
+        λ0.
+    cells, margin, apart
+        Of the guide's face per side, on each side of it, and of one side beyond.
     """
 
     reflectance: Array
-    answer: Array
-    cell_mm: float
+    strength: Array
+    decay: Array
+    waves: tuple[Array, Array]
+    slowest_per_mm: float
+    cells: int
+    margin: int
+    apart: int
 
-    def on(self, height_mm: Array, thrown: float) -> Array:
-        """Factor, over a flat face, of light that goes in and again of light that comes out, (m, m), where
-        the face is at heights [iy, ix] (m, m), mm, and throws back such a share of what comes up under it.
+    def on(self, height_mm: Array, thrown: float) -> Bend:
+        """Under a face of heights [iy, ix], mm, on as many cells or so many times finer ones, which throws
+        back such a share of what comes up under it."""
+        height = _straight_on(_within(height_mm, self.cells), self.margin, self.margin + self.apart)
+        face = np.sqrt(self.strength) / (1.0 - thrown * self.reflectance)
+        return Bend(self, face, height - height.mean())
 
-        What comes back there of light all over is f + G * (f - 1) / G(0) times as much, f² where it is even.
+
+@dataclass(frozen=True)
+class Bend:
+    """A `Bent` under one face.
+
+    Attributes
+    ----------
+    amplitude : (m, m // 2 + 1)
+        A.
+    height_mm : (m, m)
+        Of the face, over its mean; beside it it goes on straight.
+    """
+
+    bent: Bent
+    amplitude: Array
+    height_mm: Array
+
+    def factor(self, entering: Array, upward: Array) -> Array:
+        """Light that goes up under the face, over what goes up under a flat one, on the face's cells.
+
+        Parameters
+        ----------
+        entering, upward : (n, w, w)
+            E and V of `spread`, W/mm², with the margin, on the tissue's cells or so many times finer ones.
         """
-        bends = np.zeros(height_mm.shape)
-        bends[1:-1] -= np.diff(height_mm, 2, axis=0)
-        bends[:, 1:-1] -= np.diff(height_mm, 2, axis=1)
-        # what is seen of the rim comes from this side of it: the other is taken to be its mirror image
-        spectrum = scipy.fft.dctn(np.pad(bends[1:-1, 1:-1], 1, mode="edge") / self.cell_mm**2, workers=1)
-        again = 1.0 / (1.0 - thrown * self.reflectance)
-        given = self.reflectance * again
-        spectrum *= self.answer * again / (1.0 + given / given[0, 0])
-        return np.asarray(1.0 + 0.5 * scipy.fft.idctn(spectrum, workers=1))
+        wide = len(self.height_mm) - self.bent.apart
+        change = self._change(_within(entering, wide))[..., :wide, :wide]
+        light = _within(upward, wide)
+        seen = light > _FAINT * light.max(axis=(-2, -1), keepdims=True)
+        change = np.divide(change, light, out=np.zeros_like(light), where=seen)
+        inside = slice(self.bent.margin, wide - self.bent.margin)
+        found = 1.0 + np.clip(change[..., inside, inside], -_AT_MOST, _AT_MOST)
+        return _between(found, entering.shape[-1] // wide)
+
+    def _change(self, entering: Array) -> Array:
+        """δV of E."""
+        bent, box = self.bent, self.height_mm.shape
+        light = self.amplitude * scipy.fft.rfft2(entering, box, workers=1)
+
+        def layer(symbol: NDArray[np.inexact] | float) -> NDArray[np.complex128]:
+            """The operator of a symbol before and after the heights."""
+            field = scipy.fft.irfft2(symbol * light, box, workers=1)
+            return np.asarray(symbol * scipy.fft.rfft2(self.height_mm * field, workers=1))
+
+        along, up = (1j * wave for wave in bent.waves)
+        change = layer(bent.slowest_per_mm) - layer(along) - layer(up) - layer(bent.decay)
+        return np.asarray(scipy.fft.irfft2(self.amplitude * change, box, workers=1))
 
 
-def bent(tissue: TissueOptics, width_mm: float, cells: int) -> Bent:
-    """Prepare the answer on `cells` x `cells` cells over a face of `width_mm`."""
-    per_mm, cell = tissue.transport_per_mm, width_mm / cells
-    line = np.pi / width_mm * np.arange(cells)
-    wave = np.clip(np.hypot(line, line[:, None]) / per_mm, _LEAST, _MOST)
+def bent(tissue: TissueOptics, width_mm: float, cells: int, margin: int, apart: int) -> Bent:
+    """Prepare tissue under a face of `width_mm` on `cells` x `cells` cells, with a margin, and cells `apart`
+    at least between the map and where it comes again; without either it goes on as it began."""
+    apart = scipy.fft.next_fast_len(cells + 2 * margin + apart, real=True) - cells - 2 * margin
+    wide, step, per_mm = cells + 2 * margin + apart, width_mm / cells, tissue.transport_per_mm
+    along, up = (2.0 * np.pi * waves(wide, step) for waves in (scipy.fft.rfftfreq, scipy.fft.fftfreq))
+    wave = np.hypot(along, up[:, None]) / per_mm
     nodes = np.geomspace(_LEAST, _MOST, _NODES)
-    flat = np.maximum(tissue.slab.reflectance(nodes), 1e-12)
-    decay, mean = tissue.slab.decay_rate, float(_EVEN.mean())
-    low, high = np.log(np.maximum(tissue.slab.reflectance(_EVEN), 1e-12))
-    even = (high - low) / float(np.ptp(_EVEN)) * np.hypot(decay, mean) / mean / per_mm
-    answer = even * 0.5 ** (wave**2 / (0.06 + 0.45 * decay**2))
-    return Bent(np.interp(np.log(wave), np.log(nodes), flat), answer, cell)
+    flat, slowest = tissue.slab.reflectance(nodes), tissue.slab.decay_rate
+    # (λ/k) dR/dk = 2 λ dR/d(k²)
+    steep = -2.0 * np.hypot(slowest, nodes) * np.gradient(flat, nodes**2)
+    steep = np.maximum(steep, 0.0) * np.polyval(_STRONG, slowest) / per_mm
+    at = np.log(np.clip(wave, _LEAST, _MOST))
+    reflectance, strength = (np.interp(at, np.log(nodes), one) for one in (flat, steep))
+    strength *= np.exp(-((wave * per_mm * step / np.pi / _SHARP) ** 2))
+    decay = per_mm * np.hypot(slowest, wave)
+    return Bent(reflectance, strength, decay, (along, up[:, None]), per_mm * slowest, cells, margin, apart)
+
+
+def _within(maps: Array, cells: int) -> Array:
+    """Means over squares of the last two axes, so many cells per side."""
+    side = maps.shape[-1] // cells
+    parts = [maps[..., i::side, j::side] for i in range(side) for j in range(side)]
+    return np.asarray(sum(parts[1:], parts[0]) / side**2)
+
+
+def _between(maps: Array, factor: int) -> Array:
+    """On cells so many times finer, linear in between."""
+    if factor == 1:
+        return maps
+    cells = maps.shape[-1]
+    middles, finer = np.arange(cells) + 0.5, (np.arange(factor * cells) + 0.5) / factor
+    step = np.stack([np.interp(finer, middles, column) for column in np.eye(cells)], axis=1)
+    return np.asarray(step @ maps @ step.T)
+
+
+def _straight_on(height: Array, before: int, after: int) -> Array:
+    """With cells before and after, in which each row and column goes on as it ends."""
+    steps = np.arange(-before, len(height) + after)
+    near = np.clip(steps, 0, len(height) - 1)
+    over = (steps - near)[:, None]
+    for _ in range(2):
+        slope = np.where(over < 0, height[1] - height[0], height[-1] - height[-2])
+        height = (height[near] + over * slope).T
+    return height

@@ -23,7 +23,7 @@ from .tissue import Coupling
 Array = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
-_SMOOTHING_CELLS = 2.5  # standard deviation of the smoothing kernel
+_SMOOTHING_CELLS = 1.75  # standard deviation of the smoothing kernel
 _RIM_CELLS = 2  # 0.5 mm
 
 

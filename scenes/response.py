@@ -152,8 +152,9 @@ class Response:
         inside = self.under.inside
 
         def one(number: int) -> Array:
-            entering = self._entering(landed, number, self._modes)
-            return self._solved(entering, 1e-3)[..., inside, inside] * self.under.bends
+            source = self.under.wide(self._entering(landed, number, self._modes))
+            found = self._answered(source, 1e-3)
+            return found[..., inside, inside] * self.under.factor(source, found)
 
         return np.stack(abreast(one, len(landed.light)), axis=1)
 
@@ -164,22 +165,24 @@ class Response:
         def one(number: int) -> Array:
             entering = self._entering(landed, number)
             straight = self._passage.enter(entering, glimpse=False)[0]
-            found = self._solved(entering[:, : self._modes], 1e-3, straight)
-            return found[..., inside, inside] * self.under.bends
+            source = self.under.wide(entering[:, : self._modes], straight)
+            found = self._answered(source, 1e-3)
+            return found[..., inside, inside] * self.under.factor(source, found)
 
         return np.stack(abreast(one, len(landed.light)), axis=1)
 
     def seen(self, landed: Landed) -> list[Seen]:
         """`Under.seen`, and its derivatives to each parameter."""
         found = abreast(lambda number: self._seen(landed, number), len(landed.light))
-        return [self.under.bend(Seen.of(parts)) for parts in zip(*found, strict=True)]
+        return [Seen.of(parts) for parts in zip(*found, strict=True)]
 
     def _seen(self, landed: Landed, number: int) -> list[Seen]:
         """The same of one LED."""
         passage, face = self._passage, self.under.face
         entering = self._entering(landed, number)
         straight, first = passage.enter(entering)
-        upward = self._solved(entering[:, : self._modes], 1e-6, straight)
+        source = self.under.wide(entering[:, : self._modes], straight)
+        upward = self._answered(source, 1e-6)
         further, again = passage.thrown_back(upward, face)
         more = np.zeros_like(upward)
         more[:, 0] = further
@@ -198,11 +201,12 @@ class Response:
         seen = [passage.towards_camera(*whole[0])]
         for parts, beside in zip(whole[1:], turned, strict=True):
             seen.append(passage.change_towards_camera(whole[0], [*parts, *beside]))
-        return seen
+        factor = self.under.factor(source, upward)
+        return [self.under.bent(one, factor) for one in seen]
 
     def _entering(self, landed: Landed, number: int, only: int | None = None) -> Array:
         """`irradiance.transmitted` of one LED's light and its derivatives, (1 + q, functions, m, m)."""
-        entrance, counts = self.under.entrance, self.under.counts
+        entrance, counts = self.under.entrance, self.under.ground.meets
         light = landed.light[number : number + 1]
         lights = np.concatenate([light[:, : entrance.basis.layers], landed.slopes[:, number]])
         found = transmitted(entrance, lights * counts, only).astype(np.float64)
@@ -211,16 +215,8 @@ class Response:
                 one += transmitted(steep, light[:, layers] * counts, only)[0]
         return found
 
-    def _solved(self, entering: Array, tolerance: float, straight: Array | None = None) -> Array:
-        """V of one LED's light and of its derivatives, with the margin."""
-        beside = (self.under.margin, self.under.margin)
-        wide = np.pad(entering, ((0, 0), (0, 0), beside, beside))
-        if straight is not None:
-            wide[:, 0] = straight
-        return self._answered(wide, tolerance)
-
     def _answered(self, sources: Array, tolerance: float) -> Array:
-        """V of E, and dV of dE + dW V: (1 + q, modes, m, m)."""
+        """V of E, and dV of dE + dW V: (1 + q, modes, m, m), with the margin."""
         bed = self.under.bed
         found = np.empty_like(sources)
         found[:1] = bed.solve(sources[:1], tolerance)

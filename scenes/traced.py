@@ -37,15 +37,15 @@ _FINE = 100  # on which their mean is
 _NARROWEST = 1e-4  # of a kernel: less would be no number by the time it is squared
 _BEYOND = 2.0  # how far inputs may leave what was learned, times its reach
 FORMAT = "tsis-traced-4"
-LIGHT = 12
+LIGHT = 13
 """Counts up when pictures of the same press change: what was learned or kept before is of no use then.
 9: windows of other LEDs in painted walls, thin sheets that hardly scatter; 10: tissue whose scatterings
 favour a direction (see `version`); 11: half the noise, so that pictures and references go together; 12: less
-noise of LEDs together, likewise."""
+noise of LEDs together, likewise; 13: what tissue gives back under a bent contact."""
 BIAS_SINCE = 5
 """The first light of which a quality's measured bias holds: what changed since is common to all qualities, or
 less than the bias is known to (LIGHT 7, 8: 0.11 % in a blob, 0.09 % in a background), or touches no measured
-design (9, 10), or is noise (11, 12)."""
+design (9, 10), or is noise (11, 12), or standard and reference alike (13)."""
 ARRAYS = ("centre", "axes", "nodes", "weights", "kernel", "mean", "modes")
 """Fields of `TracedLight` that are arrays."""
 

@@ -18,7 +18,7 @@ from scipy.ndimage import distance_transform_edt
 from . import housing, recurrence, trace
 from .abreast import abreast
 from .arrays import floats, numbers
-from .bent import Bent, bent
+from .bent import Bend, Bent, bent
 from .bsdf import Table
 from .gather import meet
 from .irradiance import AngularBasis, Entrance, smooth, transmitted
@@ -50,7 +50,7 @@ class Behind:
     coupling: Coupling
     passage: Passage
     spread: Spread
-    bent: Bent
+    bent: Bent  # on the cells that walks are counted on
     coarse: Behind | None
 
     @staticmethod
@@ -62,7 +62,8 @@ class Behind:
         first = passage(coupling, width, cells, margin)
         spread = spreader(body, coupling, width * wide / cells, wide)
         coarse = Behind.of(sensor, coupling, trace.CELLS) if cells > trace.CELLS else None
-        return Behind(coupling, first, spread, bent(body, width, cells), coarse)
+        curved = coarse.bent if coarse else bent(body, width, cells, margin, cells // 2)
+        return Behind(coupling, first, spread, curved, coarse)
 
 
 @dataclass(frozen=True)
@@ -256,8 +257,7 @@ class Under:
     ground: Ground
     bed: Bed
     face: Face
-    counts: Singles  # share of a cell's light that goes in where the surface is, bent as it is: (m, m)
-    bends: Singles  # factor of what comes out of it (`bent`), (m, m)
+    bend: Bend
 
     @staticmethod
     def at(basis: AngularBasis, behind: Behind, ground: Ground) -> Under:
@@ -265,8 +265,8 @@ class Under:
         entrance, face = Entrance.at(basis, ground.fraction), behind.passage.face(fraction)
         bed, inside = behind.spread.on(fraction), slice(behind.passage.margin, -behind.passage.margin)
         thrown = behind.spread.free + float(bed.excess[inside, inside].mean())
-        bends = behind.bent.on(ground.height_mm, thrown).astype(np.float32)
-        return Under(entrance, behind, ground, bed, face, ground.meets * bends, bends)
+        bend = behind.bent.on(ground.height_mm, thrown)
+        return Under(entrance, behind, ground, bed, face, bend)
 
     @cached_property
     def coarser(self) -> Under:
@@ -284,8 +284,8 @@ class Under:
         sides: enough for light that has been in the tissue before."""
 
         def one(number: int) -> Array:
-            some = landed[number : number + 1] * self.counts
-            return self._upward(transmitted(self.entrance, some, self._modes), 1e-3)[0] * self.bends
+            some = landed[number : number + 1] * self.ground.meets
+            return self._upward(transmitted(self.entrance, some, self._modes))
 
         return np.concatenate(abreast(one, len(landed)))
 
@@ -293,9 +293,9 @@ class Under:
         """The same, ahead of where it went in."""
 
         def one(number: int) -> Array:
-            entering = transmitted(self.entrance, landed[number : number + 1] * self.counts)
+            entering = transmitted(self.entrance, landed[number : number + 1] * self.ground.meets)
             straight = self.behind.passage.enter(entering, glimpse=False)[0]
-            return self._upward(entering[:, : self._modes], 1e-3, straight)[0] * self.bends
+            return self._upward(entering[:, : self._modes], straight)
 
         return np.concatenate(abreast(one, len(landed)))
 
@@ -309,21 +309,28 @@ class Under:
         passage = self.behind.passage
 
         def one(number: int) -> Seen:
-            entering = transmitted(self.entrance, landed[number : number + 1] * self.counts)
+            entering = transmitted(self.entrance, landed[number : number + 1] * self.ground.meets)
             straight, glimpse = passage.enter(entering)
-            _, upward = self._upward(entering[:, : self._modes], 1e-6, straight)
+            source = self.wide(entering[:, : self._modes], straight)
+            upward = self.bed.solve(source, 1e-6)
             further, again = passage.thrown_back(upward, self.face)
             more = np.zeros_like(upward)
             more[:, 0] = further
             more = self.bed.solve(more, 1e-3)
             last = passage.last_thrown_back(more, self.face)
-            return passage.towards_camera(glimpse, again, last)
+            seen = passage.towards_camera(glimpse, again, last)
+            return self.bent(seen, self.factor(source, upward))
 
-        return self.bend(Seen.of(abreast(one, len(landed))))
+        return Seen.of(abreast(one, len(landed)))
 
-    def bend(self, seen: Seen) -> Seen:
+    def factor(self, source: Array, upward: Array) -> Array:
+        """Light under this face over that under a flat one, (1, 1, m, m), of what goes in and comes up there,
+        (n, modes, w, w) with the margin; of the first alone, where derivatives follow."""
+        return self.bend.factor(source[:1, 0], upward[:1, 0])[:, None]
+
+    def bent(self, seen: Seen, factor: Array) -> Seen:
         """Light under a flat face as it leaves this one, in place."""
-        seen.maps[..., self.inside, self.inside] *= self.bends
+        seen.maps[..., self.inside, self.inside] *= factor
         return seen
 
     def glanced(self, upward: Array) -> Seen:
@@ -332,16 +339,19 @@ class Under:
         maps = np.pad(np.einsum("i,niyx->yx", steep, upward), self.margin)[None, None]
         return Seen(maps, np.zeros(1), np.zeros(1))
 
-    def _upward(
-        self, entering: Singles, tolerance: float, straight: Array | None = None
-    ) -> tuple[Array, Array]:
-        """V without the margin, and with it."""
+    def wide(self, entering: NDArray[np.floating], straight: Array | None = None) -> Array:
+        """What goes in, with the margin; of mode 0 as it is ahead of where it went in, if that is known."""
         beside = (self.margin, self.margin)
-        wide = np.pad(entering.astype(np.float64), ((0, 0), (0, 0), beside, beside))
+        found = np.pad(entering.astype(np.float64), ((0, 0), (0, 0), beside, beside))
         if straight is not None:
-            wide[:, 0] = straight
-        found = self.bed.solve(wide, tolerance)
-        return found[..., self.inside, self.inside], found
+            found[:, 0] = straight
+        return found
+
+    def _upward(self, entering: Singles, straight: Array | None = None) -> Array:
+        """V under this face, without the margin."""
+        source = self.wide(entering, straight)
+        found = self.bed.solve(source, 1e-3)
+        return found[..., self.inside, self.inside] * self.factor(source, found)
 
     @property
     def inside(self) -> slice:

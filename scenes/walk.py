@@ -36,7 +36,7 @@ _FIXED_POINT = float(
 _LOTS = 32  # independent shares of the light, whose spread is the error
 _FAINT = 0.5  # weight below which Russian roulette is played
 _MOST_STEPS = 50_000
-_STATE = ("where", "direction", "weight", "through", "alive", "step", "random")
+_STATE = ("where", "direction", "weight", "through", "alive", "step", "depth", "normal", "random")
 _ANGLES = 1024  # nodes of a face's transmittance over the cosine
 
 
@@ -88,7 +88,7 @@ class Ball:
 @dataclass(frozen=True)
 class Body:
     """What light walks in: a half-space, or a slab in front of a Lambertian backing; another medium may be in
-    it, and its face may be bent, little over a free path."""
+    it, and its face may be bent, by a height over x and y, little over a free path."""
 
     medium: Medium
     thickness_mm: float = np.inf
@@ -224,16 +224,22 @@ def roam(
         """Depth, and the face's normal."""
         return (point.z, mi.Vector3f(0.0, 0.0, 1.0)) if body.face is None else body.face.at(point)
 
-    def going(where, direction, weight, through, alive, step, random, *scores):  # type: ignore[no-untyped-def]
+    def going(where, direction, weight, through, alive, step, depth, normal, random, *scores):  # type: ignore[no-untyped-def]
         return alive
 
-    def on(where, direction, weight, through, alive, step, random, *scores):  # type: ignore[no-untyped-def]
-        depth, normal = lies(where)
+    def on(where, direction, weight, through, alive, step, depth, normal, random, *scores):  # type: ignore[no-untyped-def]
         sinks = dr.dot(direction, normal)
         up = sinks < 0.0
         free = -dr.log(1.0 - random.next_float32()) * longest
         face = dr.select(up, -depth, bottom - depth) / sinks
         face = dr.select(sinks == 0.0, dr.inf, face)
+        if body.face is not None:  # which bends away from the plane that touches it: one step of Newton's
+            tried = dr.minimum(face, free)
+            below, leaning = lies(where + tried * direction)
+            climbs = -dr.dot(direction, leaning)
+            nearer = dr.select(climbs > 0.0, dr.maximum(tried + below / climbs, 0.0), dr.inf)
+            met = (up & (face <= free)) | (below < 0.0)
+            face, up = dr.select(met, nearer, face), up | met
         meets = free >= face
         ahead = where + dr.minimum(free, face) * direction
         at_face, at_bottom = meets & up, meets & ~up
@@ -276,7 +282,7 @@ def roam(
         weight = dr.select(random.next_float32() < survives, weight / survives, 0.0)
         weight = dr.select(step < _MOST_STEPS, weight, 0.0)
         alive = alive & ~leaves & (weight > 0.0)
-        return where, direction, weight, through, alive, step + 1, random, *scores
+        return where, direction, weight, through, alive, step + 1, depth, normal, random, *scores
 
     state = (
         mi.Point3f(where),
@@ -285,11 +291,14 @@ def roam(
         dr.zeros(mi.Float, lanes),
         dr.full(mi.Bool, True, lanes) & active,
         dr.zeros(mi.UInt32, lanes),
+        *(place * dr.full(mi.Float, 1.0, lanes) for place in lies(mi.Point3f(where))),
         random,
         *scores,
     )
     labels = (*_STATE, *(f"score_{number}" for number in range(len(scores))))
-    where, direction, weight, through, _, _, random, *scored = dr.while_loop(state, going, on, labels=labels)
+    where, direction, weight, through, _, _, _, _, random, *scored = dr.while_loop(
+        state, going, on, labels=labels
+    )
     return where, direction, weight, through, random, tuple(scored)
 
 
