@@ -41,7 +41,8 @@ LIGHT = 13
 """Counts up when pictures of the same press change: what was learned or kept before is of no use then.
 9: windows of other LEDs in painted walls, thin sheets that hardly scatter; 10: tissue whose scatterings
 favour a direction (see `version`); 11: half the noise, so that pictures and references go together; 12: less
-noise of LEDs together, likewise; 13: what tissue gives back under a bent contact."""
+noise of LEDs together, likewise; 13: what tissue gives back under a bent contact, and narrower smoothing, by
+which references of light learned before are 0.1 % off."""
 BIAS_SINCE = 5
 """The first light of which a quality's measured bias holds: what changed since is common to all qualities, or
 less than the bias is known to (LIGHT 7, 8: 0.11 % in a blob, 0.09 % in a background), or touches no measured
