@@ -25,6 +25,7 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
+from .cells import coarser, finer
 from .tissue import TissueOptics
 
 Array = NDArray[np.float64]
@@ -68,7 +69,7 @@ class Bent:
     def on(self, height_mm: Array, thrown: float) -> Bend:
         """Under a face of heights [iy, ix], mm, on as many cells or so many times finer ones, which throws
         back such a share of what comes up under it."""
-        height = _straight_on(_within(height_mm, self.cells), self.margin, self.margin + self.apart)
+        height = _straight_on(coarser(height_mm, self.cells), self.margin, self.margin + self.apart)
         face = np.sqrt(self.strength) / (1.0 - thrown * self.reflectance)
         return Bend(self, face, height - height.mean())
 
@@ -98,13 +99,13 @@ class Bend:
             E and V of `spread`, W/mm², with the margin, on the tissue's cells or so many times finer ones.
         """
         wide = len(self.height_mm) - self.bent.apart
-        change = self._change(_within(entering, wide))[..., :wide, :wide]
-        light = _within(upward, wide)
+        change = self._change(coarser(entering, wide))[..., :wide, :wide]
+        light = coarser(upward, wide)
         seen = light > _FAINT * light.max(axis=(-2, -1), keepdims=True)
         change = np.divide(change, light, out=np.zeros_like(light), where=seen)
         inside = slice(self.bent.margin, wide - self.bent.margin)
         found = 1.0 + np.clip(change[..., inside, inside], -_AT_MOST, _AT_MOST)
-        return _between(found, entering.shape[-1] // wide)
+        return finer(found, found.shape[-1] * entering.shape[-1] // wide)
 
     def _change(self, entering: Array) -> Array:
         """δV of E."""
@@ -138,23 +139,6 @@ def bent(tissue: TissueOptics, width_mm: float, cells: int, margin: int, apart: 
     strength *= np.exp(-((wave * per_mm * step / np.pi / _SHARP) ** 2))
     decay = per_mm * np.hypot(slowest, wave)
     return Bent(reflectance, strength, decay, (along, up[:, None]), per_mm * slowest, cells, margin, apart)
-
-
-def _within(maps: Array, cells: int) -> Array:
-    """Means over squares of the last two axes, so many cells per side."""
-    side = maps.shape[-1] // cells
-    parts = [maps[..., i::side, j::side] for i in range(side) for j in range(side)]
-    return np.asarray(sum(parts[1:], parts[0]) / side**2)
-
-
-def _between(maps: Array, factor: int) -> Array:
-    """On cells so many times finer, linear in between."""
-    if factor == 1:
-        return maps
-    cells = maps.shape[-1]
-    middles, finer = np.arange(cells) + 0.5, (np.arange(factor * cells) + 0.5) / factor
-    step = np.stack([np.interp(finer, middles, column) for column in np.eye(cells)], axis=1)
-    return np.asarray(step @ maps @ step.T)
 
 
 def _straight_on(height: Array, before: int, after: int) -> Array:

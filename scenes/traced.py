@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import ies, kriging
+from .cells import finer
 from .sensor import NotModelled, Sensor
 from .surface import OpticalSurface
 
@@ -111,8 +112,8 @@ class TracedLight:
         kernel = kriging.Kernel(int(self.kernel[0]), *(float(one) for one in self.kernel[1:]))
         amounts = (kernel.terms(inputs[None], self.nodes)[0] @ self.weights).astype(np.float32)
         cells = cells or fraction.shape[0]
-        found = _enlarged(self.mean, cells)
-        found += _enlarged(np.tensordot(amounts, self.modes, 1), cells)
+        found = finer(self.mean, cells)
+        found += finer(np.tensordot(amounts, self.modes, 1), cells)
         found *= np.array([led.flux_W for led in sensor.leds], np.float32)[:, None, None, None]
         return found
 
@@ -316,12 +317,3 @@ def blocks(cells: NDArray[np.floating], to: int) -> Array:
     """Means over blocks of cells (..., g, g), `to` blocks per side."""
     step = cells.shape[-1] // to
     return np.asarray(cells.reshape(*cells.shape[:-2], to, step, to, step).mean(axis=(-3, -1)))
-
-
-def _enlarged(maps: Single, to: int) -> Single:
-    """Maps on `to` cells per side, linear in between."""
-    cells = maps.shape[-1]
-    middles, finer = (np.arange(cells) + 0.5) / cells, (np.arange(to) + 0.5) / to
-    step = np.stack([np.interp(finer, middles, column) for column in np.eye(cells)], axis=1)
-    step = step.astype(np.float32)
-    return np.asarray(np.matmul(np.matmul(step, maps), step.T))

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from . import housing, recurrence, trace
+from . import cells, housing, recurrence, trace
 from .abreast import abreast
 from .arrays import floats, numbers
 from .bent import Bend, Bent, bent
@@ -233,9 +233,7 @@ def even(maps: Singles, factor: int = 1) -> NDArray[Any]:
 
 def coarser(maps: NDArray[Any]) -> NDArray[Any]:
     """Means over squares of the last two axes that are cells of walks."""
-    side = maps.shape[-1] // trace.CELLS
-    cells = maps.reshape(*maps.shape[:-2], trace.CELLS, side, trace.CELLS, side)
-    return cells.mean(axis=(-3, -1), dtype=maps.dtype)
+    return cells.coarser(maps, trace.CELLS)
 
 
 def first_leg(led: Led) -> int:

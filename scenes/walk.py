@@ -228,6 +228,8 @@ def roam(
         return alive
 
     def on(where, direction, weight, through, alive, step, depth, normal, random, *scores):  # type: ignore[no-untyped-def]
+        if body.face is None:  # the place tells both, and the compiler knows the normal
+            depth, normal = lies(where)
         sinks = dr.dot(direction, normal)
         up = sinks < 0.0
         free = -dr.log(1.0 - random.next_float32()) * longest
