@@ -4,7 +4,8 @@ Pictures of 96 x 61 pixels, each 8 x 8 of the paper's camera: all that is compar
 Sensors and presses are alike in their four quarters, so pictures are folded, which halves their noise.
 Standard pictures are noisy, too: 0.6 % in a millimetre at the rim. A case takes 40 minutes of a core, 80
 with full contact.
-With TWIN_FIRST=3001 the reference follows other paths than those of seeds 2001 and on.
+With TWIN_FIRST=3001 the reference follows other paths than those of seeds 2001 and on; with TWIN_PASSES=24
+half as many, in half of the time.
 What `assets/light_bias.json` tells frames is measured here: `--write-bias` writes it, else it is compared.
 """
 
@@ -35,7 +36,7 @@ CASES = {
     "air, water film": lambda: _with_skin("air", gap_index=1.33),
     "air, g 0.9": lambda: dataclasses.replace(paper_sensor("air", **COARSE), tissue=Tissue(anisotropy=0.9)),
 }
-PASSES, PATHS = 48, 2**20
+PASSES, PATHS = int(os.environ.get("TWIN_PASSES", "48")), 2**20
 """Reference pictures and their light paths per LED."""
 FIRST = int(os.environ.get("TWIN_FIRST", "2001"))
 """Seed of the first."""
