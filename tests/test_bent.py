@@ -48,9 +48,17 @@ class Ripple:
 
 
 def came_back(
-    scattering: float, absorption: float, bowl: Bowl, seed: int, spot_mm: float = 0.0
+    scattering: float,
+    absorption: float,
+    bowl: Bowl,
+    seed: int,
+    spot_mm: float = 0.0,
+    *,
+    upright: bool = False,
+    thrown: float = 0.0,
 ) -> tuple[Array, Array]:
-    """Shares of Lambertian light that entered about the origin, and how far from it they came back, mm."""
+    """Shares of light that entered about the origin, and how far from it they came back, mm: Lambertian
+    light, or `upright`, along the normal, under a face that throws back such a share."""
     import drjit as dr
     import mitsuba as mi
 
@@ -58,6 +66,8 @@ def came_back(
 
     random = walk.generator(LANES, seed)
     way = mi.warp.square_to_cosine_hemisphere(mi.Point2f(random.next_float32(), random.next_float32()))
+    if upright:
+        way = mi.Vector3f(0.0, 0.0, dr.full(mi.Float, 1.0, LANES))
     body = walk.Body(walk.Medium(scattering, absorption), face=bowl)
     x, y = (
         spot_mm * part
@@ -65,7 +75,7 @@ def came_back(
     )
     start = mi.Point3f(x, y, -0.5 * (dr.square(x) + dr.square(y)) / bowl.radius)
     way = mi.Frame3f(bowl.at(start)[1]).to_world(way)
-    where, _, left = walk.roam(body, start, way, random, lambda where, cosine: mi.Float(1.0))[:3]
+    where, _, left = walk.roam(body, start, way, random, lambda where, cosine: mi.Float(1.0 - thrown))[:3]
     return np.asarray(left, np.float64), np.hypot(np.asarray(where.x), np.asarray(where.y))
 
 
@@ -104,6 +114,28 @@ def test_a_bent_face_gives_back_what_the_walk_has(variant: str, absorption: floa
     print(f"{absorption:g}/mm: {found:+.3%} ± {noise:.3%}; {foretold:+.3%}")
     assert found < -10.0 * noise
     assert abs(found - foretold) < 0.02 * abs(foretold) + 3.0 * noise
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("thrown", [0.0, 0.5])
+def test_light_towards_the_camera_is_bent_about_as_all_of_it(variant: str, thrown: float) -> None:
+    """Along the normal more of it comes from below, which feels the bend: by up to a seventh more, and the
+    noise. By reciprocity what leaves along the normal is what comes back of light that enters so."""
+    found, noise = np.transpose(
+        [
+            odd_part(
+                *(
+                    [came_back(1.0, 0.02, bowl, seed, upright=upright, thrown=thrown)[0] for seed in seeds]
+                    for bowl, seeds in ((Bowl(60.0), range(4)), (Bowl(-60.0), range(10, 14)))
+                )
+            )
+            for upright in (False, True)
+        ]
+    )
+    ratio, error = found[1] / found[0], float(np.hypot(*(noise / found)))
+    what = f"all {found[0]:+.3%}, along the normal {found[1]:+.3%}"
+    print(f"thrown back {thrown:g}: {what}: {ratio:.3f} ± {error:.3f}")
+    assert 1.0 - 3.0 * error < ratio < 1.14 + 3.0 * error
 
 
 def test_light_from_afar_is_changed_as_the_walk_has_it(variant: str) -> None:
