@@ -121,17 +121,18 @@ def test_a_bent_face_gives_back_what_the_walk_has(variant: str, absorption: floa
 def test_light_towards_the_camera_is_bent_about_as_all_of_it(variant: str, thrown: float) -> None:
     """Along the normal more of it comes from below, which feels the bend: by up to a seventh more, and the
     noise. By reciprocity what leaves along the normal is what comes back of light that enters so."""
-    found, noise = np.transpose(
-        [
-            odd_part(
-                *(
-                    [came_back(1.0, 0.02, bowl, seed, upright=upright, thrown=thrown)[0] for seed in seeds]
-                    for bowl, seeds in ((Bowl(60.0), range(4)), (Bowl(-60.0), range(10, 14)))
-                )
-            )
-            for upright in (False, True)
+
+    def changed(upright: bool) -> tuple[float, float]:
+        shares = [
+            [
+                came_back(1.0, 0.02, Bowl(radius), seed, upright=upright, thrown=thrown)[0]
+                for seed in range(first, first + 4)
+            ]
+            for first, radius in ((0, 60.0), (10, -60.0))
         ]
-    )
+        return odd_part(*shares)
+
+    found, noise = np.transpose([changed(upright) for upright in (False, True)])
     ratio, error = found[1] / found[0], float(np.hypot(*(noise / found)))
     what = f"all {found[0]:+.3%}, along the normal {found[1]:+.3%}"
     print(f"thrown back {thrown:g}: {what}: {ratio:.3f} ± {error:.3f}")
