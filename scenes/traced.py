@@ -44,10 +44,9 @@ LIGHT = 13
 favour a direction (see `version`); 11: half the noise, so that pictures and references go together; 12: less
 noise of LEDs together, likewise; 13: what tissue gives back under a bent contact, and narrower smoothing, by
 which references of light learned before are 0.1 % off."""
-BIAS_SINCE = 5
-"""The first light of which a quality's measured bias holds: what changed since is common to all qualities, or
-less than the bias is known to (LIGHT 7, 8: 0.11 % in a blob, 0.09 % in a background), or touches no measured
-design (9, 10), or is noise (11, 12), or standard and reference alike (13)."""
+BIAS_SINCE = 13
+"""The first light of which a quality's measured bias holds (`assets/light_bias.json`); later ones' too, as
+long as what they change is common to all qualities, or less than the bias is known to."""
 ARRAYS = ("centre", "axes", "nodes", "weights", "kernel", "mean", "modes")
 """Fields of `TracedLight` that are arrays."""
 
