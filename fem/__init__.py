@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from fem.plane import Press2D, press_2d
     from fem.plane_scalars import scalars_2d
     from fem.pressing import Press, press, press_moduli
+    from fem.spheres import Multipoles, multipoles
     from fem.volume import save_volume, volume_grid
 
 __all__ = [
@@ -27,6 +28,7 @@ __all__ = [
     "Emulator",
     "Inclusion",
     "Layer",
+    "Multipoles",
     "NotConverged",
     "NotModelled",
     "Pose",
@@ -37,6 +39,7 @@ __all__ = [
     "build_emulator",
     "deck",
     "load_emulator",
+    "multipoles",
     "on_background",
     "press",
     "press_2d",
@@ -56,6 +59,8 @@ _LATER = {
     "on_background": "background",
     "build_emulator": "emulating",
     "load_emulator": "emulator_file",
+    "Multipoles": "spheres",
+    "multipoles": "spheres",
     "press": "pressing",
     "press_moduli": "pressing",
     "Press2D": "plane",

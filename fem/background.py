@@ -12,15 +12,19 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 import pyvista as pv
 from numpy.typing import NDArray
 
+from fem.emulator import Emulated
 from fem.equilibrium import NotConverged
 from fem.ground import bare_geometry, carry, ground, lines
-from fem.model import NotModelled
+from fem.mesh import Geometry
+from fem.model import NotModelled, Probe, Slab
 from fem.pressing import Press
+from fem.topology import Resolution
 
 Floats = NDArray[np.float64]
 
@@ -44,13 +48,29 @@ def on_background(presses: Sequence[Press]) -> list[Press]:
     first = presses[0]
     own, res = first._geometry, first._states[0].model.layout.res
     geometry = bare_geometry(own.probe, own.slab, own.pose)
-    levels = tuple(sorted({one.indentation_0_mm for one in presses}))
     try:
-        grounds = ground(geometry, res, first.mechanics == "finite", levels)
+        return _on_ground(presses, geometry, res, first.mechanics == "finite")
     except (NotConverged, NotModelled, np.linalg.LinAlgError):  # what the own mesh found stays good
-        warnings.warn(_OWN_MESH.format(levels[-1]), stacklevel=2)
+        deepest = max(one.indentation_0_mm for one in presses)
+        warnings.warn(_OWN_MESH.format(deepest), stacklevel=2)
         return list(presses)
-    at = dict(zip(levels, grounds, strict=True))
+
+
+def spheres_on_background(
+    presses: Sequence[Emulated], probe: Probe, slab: Slab, res: Resolution
+) -> list[Emulated]:
+    """The same of presses by multipoles, on the background of presses of a resolution."""
+    return _on_ground(presses, bare_geometry(probe, slab), res, False)
+
+
+AnyPress = TypeVar("AnyPress", Press, Emulated)
+
+
+def _on_ground(
+    presses: Sequence[AnyPress], geometry: Geometry, res: Resolution, finite: bool
+) -> list[AnyPress]:
+    levels = tuple(sorted({one.indentation_0_mm for one in presses}))
+    at = dict(zip(levels, ground(geometry, res, finite, levels), strict=True))
     surfaces = [_over(one.surface, at[one.indentation_0_mm]) for one in presses]
     return [replace(one, surface=s, background="shared") for one, s in zip(presses, surfaces, strict=True)]
 

@@ -50,6 +50,9 @@ class Emulated:
         95th percentile of what held-out solves of inclusions of this kind (`Errors.alike`: of 4 mm and more,
         or not; or nearest in size) were off by: largest error of the tared displacement off the probe's
         edge, in per cent of its maximum. None where too few were held out to tell.
+    dof
+        Unknowns of plain tissue, where spheres in it are multipoles (`fem.Multipoles`, whose answers these
+        are, too).
     """
 
     surface: pv.PolyData
@@ -63,6 +66,7 @@ class Emulated:
     error_percent: float | None
     path: str = "emulated"
     background: str = "shared"
+    dof: int | None = None
 
 
 @dataclass(frozen=True)

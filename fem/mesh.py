@@ -229,8 +229,9 @@ def morph_slab(layout: Layout, geometry: Geometry, shift: Floats | None = None) 
     )
     if shift is not None:
         real[:2] += (1 - blend) * _extended(layout, shift, p)
-    inside = np.abs(p).max(axis=0) < res.reach - 1e-9
-    real[:, inside] = _o_grid(p[:, inside], res, box)
+    if res.core:
+        inside = np.abs(p).max(axis=0) < res.reach - 1e-9
+        real[:, inside] = _o_grid(p[:, inside], res, box)
     mesh = MeshHex2(rotation(geometry.pose.tilt_deg).T @ real, logical.t)
     return _checked(mesh, "slab")
 

@@ -102,9 +102,9 @@ class Model:
         return replace(self, place=place, shift=shift)
 
 
-def build(geometry: Geometry, res: Resolution, finite: bool) -> Model:
-    """Mesh a geometry."""
-    layout = geometry.layout(res)
+def build(geometry: Geometry, res: Resolution, finite: bool, layout: Layout | None = None) -> Model:
+    """Mesh a geometry; `layout`: with less symmetry than it has."""
+    layout = layout or geometry.layout(res)
     slab, probe = mesh.morph_slab(layout, geometry), mesh.morph_probe(layout, geometry)
     found = nodes(layout, geometry.slab.sides)
     place = np.hstack([slab.doflocs, probe.doflocs]).T

@@ -24,8 +24,8 @@ class Resolution:
     """Cells along each part of the mesh."""
 
     arc: int  # along 45 degrees of the inclusion = along half an edge of the box
-    core: int  # shells between the central cube and the inclusion
-    shell: int  # shells between the inclusion and the box
+    core: int  # shells between the central cube and the inclusion; 0: plain tissue, a grid without an O-grid
+    shell: int  # shells between the inclusion and the box; of plain tissue, layers of half the box
     above: int  # layers between the contact surface and the box
     below: int  # layers between the box and the chest wall
     edge: int  # between the box and the probe's edge
@@ -93,7 +93,8 @@ def slab_topology(layout: Layout) -> MeshHex2:
     """Slab in logical coordinates; the inclusion is the cube |x|, |y|, |z| <= rim about the origin."""
     res = layout.res
     n, reach = res.arc, res.reach
-    half = reach * np.arange(1, n + 1) / n
+    layers = n if res.core else res.shell
+    half = reach * np.arange(1, layers + 1) / layers
     vertical = np.concatenate(
         [
             -reach - np.arange(res.above, 0, -1.0),
@@ -104,6 +105,8 @@ def slab_topology(layout: Layout) -> MeshHex2:
         ]
     )
     points, cells = _grid(*_lateral(layout, res.edge + res.side), vertical)
+    if not res.core:
+        return MeshHex2.from_mesh(_merge([(points, cells)]))
     middle = points[:, cells].mean(axis=1)
     outside = np.abs(middle).max(axis=0) > reach
     used, cells = np.unique(cells[:, outside], return_inverse=True)

@@ -35,6 +35,7 @@ examples:
   twin simulate tsis --size 10 --depth 5 --modulus 100 --offset 3 0 --tilt 0 2 --out tilted
   twin simulate my-sensor.toml --no-inclusion --force 0.5 --mechanics linear --out flat
   twin simulate --size 9 --depth 6 --modulus 80 --mechanics emulator --emulator tsis --out quick
+  twin simulate --size 9 --depth 6 --modulus 80 --mechanics multipoles --out small-strain
 """
 
 _CHECK = """\
@@ -122,7 +123,7 @@ def _parser() -> Parser:
         "design", metavar="DESIGN", nargs="?", default="tsis", help="name or TOML file (default tsis)"
     )
     _add_inclusion_flags(simulate)
-    _add_pose_flags(simulate, "emulator")
+    _add_pose_flags(simulate, "multipoles", "emulator")
     simulate.add_argument(
         "--emulator",
         metavar="FILE.npz",

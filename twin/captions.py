@@ -9,6 +9,7 @@ _CONTACT = {
     "tied": "closed contact",
     "sliding": "closed, sliding contact",
     "unilateral": "contact open in places",
+    "multipoles": "a sphere's multipoles in plain tissue",
 }
 
 
@@ -36,7 +37,9 @@ def percent_in_words(percent: float | None, of: str = "") -> str:
 
 
 def error_in_words(fem: Mapping[str, Any]) -> str:
-    """Return what ``error_percent`` of a frame is: of the mesh, or of an emulator."""
+    """Return what ``error_percent`` of a frame is: of the mesh, of an emulator, or of multipoles."""
+    if fem["mechanics"] == "emulator":
+        return "held-out error (95 %), tared"
     return (
-        "held-out error (95 %), tared" if fem["mechanics"] == "emulator" else "error estimate, tared surface"
+        "last multipoles, tared surface" if fem["path"] == "multipoles" else "error estimate, tared surface"
     )

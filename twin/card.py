@@ -185,7 +185,7 @@ def _limits(corpus: Corpus) -> str:
         lines.append(
             "- Surfaces come from an emulator, whose error the table above has, not from own solves."
         )
-    if plan.mechanics == "linear":
+    if plan.mechanics in ("linear", "multipoles"):
         lines.append("- Mechanics are of small strain, which underrates presses beyond 0.5 mm.")
     if plan.light_seed == "shared":
         lines.append("- All pictures share one seed of light: its pattern is common, and mostly tares away.")

@@ -114,11 +114,11 @@ def _run(arguments: argparse.Namespace) -> int:
         _simulate(arguments, design, DEMO_INCLUSION, design.press.indentation_mm)
     elif arguments.verb == "simulate":
         options = Options()
-        if arguments.mechanics == "emulator":
-            options = Options(mechanics="emulator", emulator=arguments.emulator)
-            arguments.mechanics = None
-        elif arguments.emulator is not None:
+        if arguments.emulator is not None and arguments.mechanics != "emulator":
             raise DesignError("--emulator", "it with other mechanics", "it with --mechanics emulator only")
+        if arguments.mechanics in ("emulator", "multipoles"):
+            options = Options(mechanics=arguments.mechanics, emulator=arguments.emulator)
+            arguments.mechanics = None
         options["traced"] = arguments.traced
         design, inclusion = _pressed(arguments), _inclusion(arguments)
         levels = arguments.force or arguments.indentation or design.press.indentation_mm

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, get_args
 
-from twin.arguments import MECHANICS, QUALITIES, add_verb, choice, number, whole
+from twin.arguments import QUALITIES, add_verb, choice, number, whole
+from twin.study import CorpusMechanics
 
 _CORPUS = """\
 Corpora: thousands of labelled pictures to train on, resumable and verifiable. See CORPORA.md.
@@ -97,9 +98,9 @@ def _add_plan(actions: Any) -> None:
     plan.add_argument("--seed", type=whole, metavar="N", help="of all random numbers (default: the study's)")
     plan.add_argument(
         "--mechanics",
-        type=choice(*MECHANICS, "emulator"),
+        type=choice(*get_args(CorpusMechanics)),
         metavar="M",
-        help=", ".join((*MECHANICS, "emulator")) + " (default: the study's)",
+        help=", ".join(get_args(CorpusMechanics)) + " (default: the study's)",
     )
     plan.add_argument(
         "--emulator",

@@ -36,6 +36,7 @@ from twin.planned import (
     load_plan,
     sha256,
 )
+from twin.presses import Quality
 from twin.sample_table import MAX_NUMBERS, write_samples
 from twin.settling import Columns, Drawn, Setting, drawn
 from twin.stage import has_keys, staged
@@ -94,7 +95,7 @@ def freeze(
         if light_file is not None:
             black(design, "learned light")
         if mechanics != "emulator":
-            design = design.pressed(mechanics=mechanics)
+            design = design.pressed(mechanics="linear" if mechanics == "multipoles" else mechanics)
         lit = light or settings.light or quality or settings.quality
         if light_file is not None and paths is not None:
             raise DesignError("paths", f"{paths} with learned light", "it with light that follows paths")
@@ -102,7 +103,11 @@ def freeze(
             raise DesignError(
                 "traced", "it with light = 'reference'", "it with 'preview' or 'standard' light"
             )
-        setting = _setting(source, design, settings.seed if seed is None else seed, file, light_file)
+        seed = settings.seed if seed is None else seed
+        pressed = quality or settings.quality if mechanics == "multipoles" else None
+        if pressed is not None:
+            presses.check_expanded(design, None, pressed)
+        setting = _setting(source, design, seed, file, light_file, pressed)
     except DesignError as error:
         field = re.sub(r"^press\.(indentation_mm)", r"\1", error.field)
         raise error.renamed(field, source=error.source or source.name) from None
@@ -182,7 +187,14 @@ def _emulator_file(
     return learned.usual_emulator(design.name)
 
 
-def _setting(source: Source, design: Design, seed: int, file: Path | None, traced: Path | None) -> Setting:
+def _setting(
+    source: Source,
+    design: Design,
+    seed: int,
+    file: Path | None,
+    traced: Path | None,
+    multipoles: Quality | None,
+) -> Setting:
     """Return what all samples share, checked."""
     tables = tables_of(design)
     tables["press"]["indentation_mm"] = list(source.study.indentation_mm)
@@ -193,7 +205,7 @@ def _setting(source: Source, design: Design, seed: int, file: Path | None, trace
         check_bounds(f"randomise.{one.field}", one.distribution, one.base)
     emulator = None if file is None else presses.emulator_of(design, file)
     light = None if traced is None else light_of(traced)
-    return Setting(seed, tables, design, varied, emulator, light)
+    return Setting(seed, tables, design, varied, emulator, light, multipoles)
 
 
 def _joined(setting: Setting, groups: Sequence[Drawn]) -> tuple[list[str], Columns]:

@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 import fem
-from fem import emulator_limits
+from fem import emulator_limits, spheres
+from fem.background import spheres_on_background
+from fem.mesh import QUALITIES
 from fem.model import check as check_mechanics
 from twin import learned
 from twin.complaint import DesignError, shown
@@ -212,6 +215,45 @@ def check_emulated(
             emulator_limits.within("indentation", level, plan.ranges.indentation_mm, "mm")
 
 
+def expanded(
+    design: Design,
+    inclusion: fem.Inclusion | None,
+    levels: Sequence[float],
+    *,
+    by_force: bool = False,
+    quality: Quality = "standard",
+) -> list[Emulated]:
+    """Return the presses at small strain by multipoles in tissue that is solved once (`fem.multipoles`), on
+    the background of `solved`.
+
+    Raises
+    ------
+    DesignError, fem.NotModelled
+        In one line.
+    """
+    check_expanded(design, inclusion, quality)
+    centred = inclusion is None or not any(inclusion.offset)
+    with _in_designs_words():
+        found = _tissue(design.probe(), design.slab(), quality, centred).press(inclusion, levels, by_force)
+    if by_force:
+        _check_depth(design, found, levels)
+    return spheres_on_background(found, design.probe(), design.slab(), QUALITIES[quality])
+
+
+def check_expanded(design: Design, inclusion: fem.Inclusion | None, quality: Quality) -> None:
+    """Raise, before any work is done, for what `expanded` would refuse."""
+    if quality not in spheres.QUALITIES:
+        allowed = " or ".join(map(repr, spheres.QUALITIES))
+        raise DesignError("quality", f"{quality!r} with multipoles", allowed)
+    with _in_designs_words():
+        spheres.refuse(design.probe(), design.slab(), inclusion, design.pose())
+
+
+@lru_cache(maxsize=2)  # samples of a corpus follow each other in the same tissue
+def _tissue(probe: fem.Probe, slab: fem.Slab, quality: str, centred: bool) -> fem.Multipoles:
+    return fem.multipoles(probe, slab, quality, centred)
+
+
 @contextmanager
 def _in_designs_words() -> Iterator[None]:
     """Name what an emulator refuses as a design does."""
@@ -235,7 +277,7 @@ def _refuse_hopeless(design: Design, forces: Sequence[float]) -> None:
             raise _too_deep(design, force, flat.force_N)
 
 
-def _check_depth(design: Design, presses: Sequence[Press], forces: Sequence[float]) -> None:
+def _check_depth(design: Design, presses: Sequence[Press | Emulated], forces: Sequence[float]) -> None:
     """Raise `DesignError` if one of the forces presses deeper than is allowed."""
     for force, press in zip(forces, presses, strict=True):
         deepest = max(press.indentation_mm, press.indentation_0_mm)

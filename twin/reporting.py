@@ -130,6 +130,8 @@ def _trust(frames: Sequence[Frame]) -> Iterator[str]:
         largest = None if None in errors else max(errors)
         told = percent_in_words(largest, " of the tared displacement's maximum")
         what = "estimated error of the mesh"
+        if frames[0].fem["path"] == "multipoles":
+            what = "what the last multipoles change"
         if frames[0].fem["mechanics"] == "emulator":
             what = "95 % of held-out solves were met within"
         yield f"{what}: {told}"

@@ -67,6 +67,8 @@ def pressed(plan: Plan, number: int) -> list[Contact]:
     found: Any
     if plan.mechanics == "emulator":
         found = presses.emulated(design, inclusion, levels, _emulator(str(plan.emulator)))
+    elif plan.mechanics == "multipoles":
+        found = presses.expanded(design, inclusion, levels, quality=plan.quality)
     else:
         found = presses.solved(design, inclusion, levels, quality=plan.quality, pictured=True)
     return [

@@ -37,7 +37,8 @@ _SOON = 200  # draws after which that share is looked at
 
 @dataclass(frozen=True)
 class Setting:
-    """What all groups share: the design, as nested tables too, its numbers that vary, who presses."""
+    """What all groups share: the design, as nested tables too, its numbers that vary, who presses: an
+    emulator, multipoles of a quality, or neither."""
 
     seed: int
     tables: Mapping[str, Any]
@@ -45,6 +46,7 @@ class Setting:
     varied: tuple[Varied, ...]
     emulator: Emulator | None
     traced: tuple[TracedLight, ...] | None = None
+    multipoles: presses.Quality | None = None
 
     def check(self, columns: Columns, number: int) -> None:
         """Raise ValueError, in one line, if a sample cannot be simulated."""
@@ -58,6 +60,8 @@ class Setting:
         presses.check(design, inclusion, levels)
         if self.emulator is not None:
             presses.check_emulated(design, inclusion, levels, self.emulator)
+        if self.multipoles is not None:
+            presses.check_expanded(design, inclusion, self.multipoles)
         if self.traced is not None:
             from scenes import spectral, traced
 

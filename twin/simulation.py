@@ -69,7 +69,7 @@ class _Light(TypedDict):
 class Options(TypedDict, total=False):
     """What `simulate` takes beside the press, for whichever form of it."""
 
-    mechanics: Mechanics | Literal["emulator"] | None
+    mechanics: Mechanics | Literal["emulator", "multipoles"] | None
     emulator: Emulator | str | Path | None
     tilt: Sequence[float] | None
     position: Sequence[float] | None
@@ -111,7 +111,7 @@ def simulate(
     indentation: float | Sequence[float] | None = None,
     *,
     force: float | Sequence[float] | None = None,
-    mechanics: Mechanics | Literal["emulator"] | None = None,
+    mechanics: Mechanics | Literal["emulator", "multipoles"] | None = None,
     emulator: Emulator | str | Path | None = None,
     tilt: Sequence[float] | None = None,
     position: Sequence[float] | None = None,
@@ -130,8 +130,8 @@ def simulate(
     inclusion : what lies in the tissue; None for homogeneous tissue.
     indentation : depth that the glass moves towards the chest wall, mm; by default the first of the design.
     force : force on the glass instead, N, along the sensor's axis.
-    mechanics : "finite" strain or "linear" elasticity, instead of the design's; or "emulator": no solve, but
-        what an emulator learned from many.
+    mechanics : "finite" strain or "linear" elasticity, instead of the design's; or "multipoles": the latter
+        of spheres in plain tissue that is solved once; or "emulator": what one learned from many solves.
     emulator : with mechanics "emulator", a `fem.Emulator` or its file, by default "emulators/NAME.npz" with
         the design's name; see `twin emulate`.
     tilt : turn of the sensor about x, then y, degrees, instead of the design's.
@@ -149,7 +149,7 @@ def simulate(
         In one line: what was received and what is allowed.
     """
     design = design if isinstance(design, Design) else load_design(design)
-    solves = None if mechanics == "emulator" else mechanics
+    solves = {"emulator": None, "multipoles": "linear"}.get(str(mechanics), mechanics)
     design = design.pressed(mechanics=solves, tilt_deg=tilt, position_mm=position)
     levels, by_force, several = presses.levels_of(design, indentation, force)
     check(design, inclusion, levels, by_force=by_force)
@@ -159,8 +159,8 @@ def simulate(
     coloured = design.specimen.inclusion is not None
     if coloured and quality != "reference":
         colourless(design, f"{quality} quality")
-    if coloured and mechanics == "emulator":
-        colourless(design, "presses of an emulator, which does not know where the inclusion goes")
+    if coloured and mechanics in ("emulator", "multipoles"):
+        colourless(design, f"mechanics {mechanics}, which do not tell where the inclusion goes")
     light = None
     if traced is not None:
         if quality == "reference" or noise is not None:
@@ -175,6 +175,8 @@ def simulate(
         pressed = presses.emulated(design, inclusion, levels, known, by_force=by_force)
     elif emulator is not None:
         raise DesignError("emulator", "it with other mechanics", 'it with mechanics "emulator" only')
+    elif mechanics == "multipoles":
+        pressed = presses.expanded(design, inclusion, levels, by_force=by_force, quality=quality)
     from scenes import SpectralRenderer
 
     renderer = SpectralRenderer(

@@ -28,7 +28,7 @@ PARAMETERS = ("size_mm", "depth_mm", "modulus_kPa", "offset_x_mm", "offset_y_mm"
 """What an inclusion is sampled in."""
 
 Sampler = Literal["uniform", "latin", "sobol", "grid", "table"]
-CorpusMechanics = Literal["finite", "linear", "emulator"]
+CorpusMechanics = Literal["finite", "linear", "multipoles", "emulator"]
 LightSeed = Literal["shared", "own"]
 Paths = Annotated[int, Field(ge=2**10, le=2**32)]
 """Light paths from each LED."""
