@@ -12,7 +12,7 @@ from fem import mesh, solver
 from fem.equilibrium import Body, NotConverged, Preconditioner, State
 from fem.mesh import Geometry
 from fem.meshed import build
-from fem.operators import Matrices, product
+from fem.operators import Matrices, Sheared, product
 from fem.path import path
 
 Floats = NDArray[np.float64]
@@ -41,7 +41,7 @@ def softest(body: Body, state: State) -> tuple[float, float]:
 
         return LinearOperator((sys.tree.size, sys.tree.size), matvec=apply, dtype=float)
 
-    factor = solver.Factor(sys.tree, tangent.sheared(sys.nodes.cells, slopes), again=False)
+    factor = solver.Factor(sys.tree, Sheared(tangent, sys.nodes.cells, slopes), again=False)
     precondition = Preconditioner(sys, factor, slopes)
     loads = np.random.default_rng(0).normal(size=(2, sys.tree.size))
     values, modes = lobpcg(
