@@ -21,12 +21,13 @@ from fem.system import System
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
+_ON = 1e-9  # mm from a plane, on it
 _LATTICE = np.round(2 * ElementHex2.doflocs.T).astype(int)
 
 
 @dataclass(frozen=True)
 class Given:
-    """Nodes whose displacement is given: the probe's contact, along z, and the chest wall."""
+    """Nodes whose displacement is given: contact along z, the chest wall, symmetric sides across."""
 
     place: Floats  # (n, 3) mm
     stiffness: csr_matrix  # forces on the unknowns of displacements (3 n,) there, mN / mm
@@ -44,13 +45,29 @@ class Free:
 def given_of(model: Model, sys: System, matrices: AtRest) -> Given:
     """Stiffness between the unknowns and the displacements that are given."""
     nodes = model.nodes
-    at = np.concatenate([nodes.contact.ravel(), nodes.chest])
+    known = np.zeros((len(model.place), 3), dtype=bool)
+    known[nodes.contact, 2] = True  # the slab slides along the probe
+    known[nodes.chest] = True
+    if model.geometry.slab.sides == "symmetric":
+        for axis, value, _ in _sides(model):
+            known[: nodes.slab, axis] |= np.abs(model.place[: nodes.slab, axis] - value) < _ON
+    at = np.flatnonzero(known.any(axis=1))
     column = np.full((len(model.place), 3), -1)
     column[at] = np.arange(3 * len(at)).reshape(-1, 3)
-    column[nodes.contact.ravel(), :2] = -1  # the slab slides along the probe
+    column[~known] = -1
     slab = np.arange(len(nodes.cells)) < nodes.slab_cells
     shape = (sys.tree.size, 3 * len(at))
     return Given(model.place[at], _entries(matrices, nodes.cells, slab, sys.unknown, column.ravel(), shape))
+
+
+def _sides(model: Model) -> list[tuple[int, float, float]]:
+    """The slab's sides that are meshed: axis, place, and direction outwards."""
+    half = model.geometry.slab.width_mm / 2
+    return [
+        (axis, sign * half, sign)
+        for axis, mirrored in enumerate(model.layout.symmetric)
+        for sign in ((1.0,) if mirrored else (-1.0, 1.0))
+    ]
 
 
 def reaction_of(model: Model, sys: System, matrices: AtRest) -> csr_matrix:
@@ -76,11 +93,8 @@ def _entries(
 
 
 def free_of(model: Model, sys: System) -> Free:
-    """Gauss points of the face towards the probe, and of the sides where they are free."""
-    half, planes = model.geometry.slab.width_mm / 2, [(2, 0.0, -1.0)]
-    if model.geometry.slab.sides == "free":
-        for axis, mirrored in enumerate(model.layout.symmetric):
-            planes += [(axis, sign * half, sign) for sign in ((1.0,) if mirrored else (-1.0, 1.0))]
+    """Gauss points of the face towards the probe and of the sides; their tractions work on unknowns only."""
+    planes = [(2, 0.0, -1.0), *_sides(model)]
     found = [_faces(model, axis, value) for axis, value, _ in planes]
     normals = [
         np.tile(sign * np.eye(3)[axis], (9 * len(part), 1))
@@ -106,7 +120,7 @@ def free_of(model: Model, sys: System) -> Free:
 def _faces(model: Model, axis: int, value: float) -> Ints:
     """Nodes (m, 9) of the slab's nine-node faces on a plane, in the order of `_nine_nodes`."""
     cells = model.nodes.cells[: model.nodes.slab_cells]
-    outer = np.abs(model.place[:, axis] - value) < 1e-9
+    outer = np.abs(model.place[:, axis] - value) < _ON
     found = []
     for across in range(3):
         others = [a for a in range(3) if a != across]
