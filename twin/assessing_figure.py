@@ -21,9 +21,8 @@ if TYPE_CHECKING:
 
 _LABELS = ("size d / mm", "depth h / mm", "modulus E / kPa")
 _COLOURS = (BLUE, RED)
-_KOLMOGOROV = (
-    1.358  # largest distance of a distribution of n draws from its own, times sqrt(n), in 95 % of cases
-)
+_KOLMOGOROV = 1.358
+"""Largest distance of a distribution of n draws from its own, times sqrt(n), in 95 % of cases."""
 _MOST = 97.0  # per cent of the intervals that errors are drawn to the ends of
 
 
