@@ -111,7 +111,7 @@ def test_beams_come_back_as_the_walk_says(steps: ModuleType, cosine: float) -> N
     assert np.all(np.abs(lobe - walked.lobe) < 4.5 * walked.lobe_error + 0.003 * lobe)
 
 
-@pytest.mark.parametrize("cosine", [0.3, 0.7])
+@pytest.mark.parametrize("cosine", [0.3, pytest.param(0.7, marks=pytest.mark.slow)])
 def test_light_that_enters_aslant_comes_out_ahead(steps: ModuleType, variant: str, cosine: float) -> None:
     """Where it leaves, mean and squares along and across the way in: of all light, and of what leaves within
     13 degrees of the normal. Of that, how much more leaves leaning ahead, and where that comes from."""

@@ -17,7 +17,9 @@ SHEETS = {
 }
 
 
-@pytest.mark.parametrize("name", SHEETS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow) if n.startswith("clear") else n for n in SHEETS]
+)
 def test_all_light_is_the_references(variant: str, name: str) -> None:
     """What a backing throws back is seen without another scattering; radiance is of the sheet's index."""
     from scenes import Renderer
