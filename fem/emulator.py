@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -24,7 +24,7 @@ from fem.ground import cubic
 from fem.mesh import Geometry
 from fem.model import Inclusion, Probe, Slab
 from fem.regression import Regression
-from fem.sampling import CLEARANCE, Plan, contrast, lines
+from fem.sampling import CLEARANCE, Plan, contrast, lines, lines_of
 from fem.solving import knots
 from fem.symmetry import Image, images, unfold
 from fem.topology import Resolution
@@ -196,43 +196,44 @@ def fields_of(
 ) -> list[list[dict[str, Floats]]]:
     """`fields` but for the areas, of many specimens at several indentations each, in mm.
 
-    Regressions are worked out for all together, a specimen's share of its presses once.
+    Specimens are worked out all together, and those that are alike once: where slopes are found, most differ
+    in their indentations alone, or in what does not bear on the press.
     """
-    there = [(slab, inclusion) for slab, inclusion, _ in cases if inclusion is not None]
-    learned = iter(_learned(emulator, there))
-    found = []
-    for slab, inclusion, depths in cases:
-        levels = [lagrange(emulator.plan.levels, depth) for depth in depths]
-        added: Sequence[tuple[Floats, Floats] | None] = [None for _ in levels]
-        if inclusion is not None:
-            added = signals(emulator, slab, inclusion, levels, next(learned))
-        found.append(
-            [
-                _pressed(emulator, slab, depth, level, more)
-                for depth, level, more in zip(depths, levels, added, strict=True)
-            ]
-        )
-    return found
+    specimens = list(dict.fromkeys((slab, some) for slab, some, _ in cases if some is not None))
+    added = dict(zip(specimens, _signals(emulator, specimens), strict=True))
+    plain = {slab: _plain(emulator, slab) for slab in dict.fromkeys(slab for slab, _, _ in cases)}
+    return [
+        [
+            _pressed(
+                plain[slab],
+                None if inclusion is None else added[slab, inclusion],
+                depth,
+                lagrange(emulator.plan.levels, depth),
+            )
+            for depth in depths
+        ]
+        for slab, inclusion, depths in cases
+    ]
 
 
-def _pressed(
-    emulator: Emulator, slab: Slab, depth: float, level: Floats, added: tuple[Floats, Floats] | None
-) -> dict[str, Floats]:
-    """`fields` at one indentation, with what the inclusion adds to it."""
-    tissue = slab.modulus_kPa
-    at = knots(emulator.plan)
+def _plain(emulator: Emulator, slab: Slab) -> tuple[Floats, Floats]:
+    """Pressure (l, m, m) and displacement (l, m, m, 3) of plain tissue at each level, per mm."""
+    at, tissue = knots(emulator.plan), slab.modulus_kPa
     weights = np.multiply.outer(
         lagrange(at[0], 1 / slab.thickness_mm), lagrange(at[1], float(np.log(tissue)))
     )
+    pressure, moved = (np.tensordot(weights, values, 2) for values in (emulator.pressure, emulator.moved))
+    return np.asarray(tissue * pressure), np.asarray(moved)
 
-    def background(values: Floats, level: Floats) -> Floats:
-        return np.asarray(np.tensordot(np.multiply.outer(weights, level), values, 3))
 
-    pressure_0 = depth * tissue * background(emulator.pressure, level)
-    displacement_0 = depth * background(emulator.moved, level)
+def _pressed(
+    plain: tuple[Floats, Floats], added: Floats | None, depth: float, level: Floats
+) -> dict[str, Floats]:
+    """`fields` at one indentation, of plain tissue and what an inclusion adds to it (`_signals`)."""
+    pressure_0, displacement_0 = (depth * np.tensordot(level, values, 1) for values in plain)
     pressure, displacement = pressure_0, displacement_0
     if added is not None:
-        rise, tared = added
+        rise, tared = _at_level(added, level)
         pressure = pressure_0 * (1 + rise)
         displacement = displacement_0 + depth * tared
     found = {}
@@ -241,20 +242,26 @@ def _pressed(
     return found
 
 
-@dataclass(frozen=True)
-class _Learned:
-    """What the regressions say of a specimen, flat fields on a mesh: rise, tared displacement and what a
-    finer mesh adds to each, for each ratio of moduli; and what finite strain adds, for each level."""
-
-    point: Floats
-    first: tuple[Floats, Floats, Floats, Floats]
-    more: tuple[Floats, Floats, Floats, Floats] | None
+def _at_level(added: Floats, level: Floats) -> tuple[Floats, Floats]:
+    """Rise (m, m) and tared displacement per mm (m, m, 3) of `_signals` at weights (l,) of the levels."""
+    whole = added[0] + np.tensordot(level[1 : len(added)], added[1:], 1)
+    return whole[0], np.moveaxis(whole[1:], 0, -1)
 
 
-def _learned(emulator: Emulator, specimens: Sequence[tuple[Slab, Inclusion]]) -> list[_Learned]:
-    """Work the regressions out for all specimens at once."""
+def signals(
+    emulator: Emulator, slab: Slab, inclusion: Inclusion, levels: Sequence[Floats]
+) -> list[tuple[Floats, Floats]]:
+    """Rise (m, m) and tared displacement per mm (m, m, 3) on the grid, for weights (l,) of levels each."""
+    added = _signals(emulator, [(slab, inclusion)])[0]
+    return [_at_level(added, level) for level in levels]
+
+
+def _signals(emulator: Emulator, specimens: Sequence[tuple[Slab, Inclusion]]) -> Floats:
+    """What each inclusion adds on the grid, (n, 1, 4, m, m): the rise and the tared displacement per mm along
+    x, y, z, at small strain; at finite strain (n, l, 4, m, m): behind it what that adds at each level but 0.
+    """
     if not specimens:
-        return []
+        return np.zeros((0, 1, 4, 0, 0))
     plan, seen, points = emulator.plan, [], []
     for number, (slab, inclusion) in enumerate(specimens):
         s = float(contrast(np.array(inclusion.modulus / slab.modulus_kPa)))
@@ -265,84 +272,73 @@ def _learned(emulator: Emulator, specimens: Sequence[tuple[Slab, Inclusion]]) ->
             )
     rows = np.array(points)
     inputs = features(plan, rows)
-    linear = inputs[:, :-1]
     first = np.unique([number for number, _ in seen], return_index=True)[1]
+    own = rows[first]
     centred = inputs[first][:, CENTRED]  # of no image: it is symmetric
-    ratios, levels = len(plan.ratios), len(plan.levels) - 1
+    along = np.stack([lagrange(contrast(plan.ratios), float(s)) for s in own[:, -1]])
+    onto = [_onto(plan, emulator.x, slab, inclusion) for slab, inclusion in specimens]
+    lean, fine, coarse = (
+        (np.stack([one[mesh][0] for one in onto]), np.stack([one[mesh][1] for one in onto]))
+        for mesh in range(3)
+    )
+
+    ratios = len(plan.ratios)
+    linear, even = inputs[:, :-1], centred[:, :-1]
     small = _blended(seen, emulator.rise(linear), emulator.tared(linear), ratios)
-    gains = emulator.finer, emulator.finer_tared
-    finer = [gain(centred[:, :-1]).reshape(len(first), ratios, -1) for gain in gains]
-    found = [
-        _Learned(point, (*two, *gain), None)
-        for point, two, *gain in zip(rows[first], small, *finer, strict=True)
-    ]
-    if not emulator.plan.finite:
-        return found
-    assert emulator.rise_more and emulator.tared_more and emulator.finer_more and emulator.finer_tared_more
-    more = _blended(seen, emulator.rise_more(inputs), emulator.tared_more(inputs), levels)
-    gains = emulator.finer_more, emulator.finer_tared_more
-    finer = [gain(centred).reshape(len(first), levels, -1) for gain in gains]
-    return [replace(one, more=(*two, *gain)) for one, two, *gain in zip(found, more, *finer, strict=True)]
-
-
-def _blended(
-    seen: Sequence[tuple[int, Image]], rise: Floats, tared: Floats, cases: int
-) -> list[tuple[Floats, Floats]]:
-    """Rise and tared displacement of each specimen (cases, ...) from those of its images, (n, ...)."""
-    side = round((rise.shape[1] / cases) ** 0.5)
-    found: dict[int, list[Floats | float]] = {}
-    for (number, image), one, other in zip(seen, rise, tared, strict=True):
-        parts = unfold(one.reshape(cases, side, side), other.reshape(cases, side, side, 3), image.turn)
-        total = found.setdefault(number, [0.0, 0.0])
-        total[:] = [before + image.share * part for before, part in zip(total, parts, strict=True)]
-    return [(np.reshape(r, (cases, -1)), np.reshape(t, (cases, -1))) for r, t in found.values()]
-
-
-def signals(
-    emulator: Emulator,
-    slab: Slab,
-    inclusion: Inclusion,
-    levels: Sequence[Floats],
-    learned: _Learned | None = None,
-) -> list[tuple[Floats, Floats]]:
-    """Rise (m, m) and tared displacement per mm (m, m, 3) on the grid, for weights (l,) of levels each."""
-    learned = learned or _learned(emulator, [(slab, inclusion)])[0]
-    plan, s = emulator.plan, float(learned.point[-1])
-    geometry = Geometry(plan.probe, slab, inclusion)
-    along = lagrange(contrast(plan.ratios), s)
-    lean, fine = (resample(geometry, res, emulator.x) for res in (plan.resolution, plan.fine))
-    coarse = lean if learned.more is None else resample(geometry, plan.coarse, emulator.x)
-    first = _on_grid(lean, fine, *(along @ part for part in learned.first))
-    scales, found = amplitudes(learned.point, s), []
-    for level in levels:
-        parts = [first]
-        if learned.more is not None:
-            parts.append(_on_grid(coarse, fine, *(level[1:] @ part for part in learned.more)))
-        whole = (sum(part) for part in zip(*parts, strict=True))
-        rise, tared = (scale * part for scale, part in zip(scales, whole, strict=True))
-        found.append((rise, tared))
+    gain = _stacked(*_unravelled(emulator.finer(even), emulator.finer_tared(even), ratios))
+    small, gain = (np.einsum("nr,nr...->n...", along, one)[:, None] for one in (small, gain))
+    parts = [_carried(lean, small) + _carried(fine, gain)]
+    if plan.finite:
+        assert emulator.rise_more and emulator.tared_more
+        assert emulator.finer_more and emulator.finer_tared_more
+        levels = len(plan.levels) - 1
+        more = _blended(seen, emulator.rise_more(inputs), emulator.tared_more(inputs), levels)
+        gains = emulator.finer_more(centred), emulator.finer_tared_more(centred)
+        gain = _stacked(*_unravelled(*gains, levels))
+        parts.append(_carried(coarse, more) + _carried(fine, gain))
+    found = np.concatenate(parts, axis=1)
+    rise, tared = amplitudes(own, own[:, -1])
+    found[:, :, 0] *= rise[:, None, None, None]
+    found[:, :, 1:] *= tared[:, None, None, None, None]
     return found
 
 
-def _on_grid(
-    onto: tuple[Floats, Floats],
-    fine: tuple[Floats, Floats],
-    rise: Floats,
-    tared: Floats,
-    finer: Floats,
-    finer_tared: Floats,
-) -> tuple[Floats, Floats]:
-    """Carry fields from a mesh's nodes, flat, to the grid, (m, m) and (m, m, 3), and what a finer mesh adds
-    to each from its nodes; see `resample`."""
-    moved = [
-        _carried(onto, less) + _carried(fine, more)
-        for less, more in zip(tared.reshape(-1, 3).T, finer_tared.reshape(-1, 3).T, strict=True)
-    ]
-    return _carried(onto, rise) + _carried(fine, finer), np.stack(moved, axis=-1)
+def _stacked(rise: Floats, tared: Floats) -> Floats:
+    """Rise (..., k, k) and displacement (..., k, k, 3) as fields (..., 4, k, k)."""
+    return np.concatenate([rise[..., None, :, :], np.moveaxis(tared, -1, -3)], axis=-3)
+
+
+def _blended(seen: Sequence[tuple[int, Image]], rise: Floats, tared: Floats, cases: int) -> Floats:
+    """Fields of each specimen (n, cases, 4, k, k) from those of its images, flat."""
+    rise, tared = _unravelled(rise, tared, cases)
+    found = np.zeros((seen[-1][0] + 1, cases, 4, *rise.shape[-2:]))
+    turns: dict[tuple[float, float], list[int]] = {}
+    for row, (_, image) in enumerate(seen):
+        turns.setdefault(image.turn, []).append(row)
+    for turn, chosen in turns.items():  # no specimen has two images of one turn
+        shares = np.array([seen[row][1].share for row in chosen])
+        turned = _stacked(*unfold(rise[chosen], tared[chosen], turn))
+        found[[seen[row][0] for row in chosen]] += shares[:, None, None, None, None] * turned
+    return found
+
+
+def _unravelled(rise: Floats, tared: Floats, cases: int) -> tuple[Floats, Floats]:
+    """Fields of regressions, flat, as (n, cases, k, k) and (n, cases, k, k, 3)."""
+    side = round((rise.shape[1] / cases) ** 0.5)
+    return rise.reshape(-1, cases, side, side), tared.reshape(-1, cases, side, side, 3)
+
+
+def _onto(plan: Plan, x: Floats, slab: Slab, inclusion: Inclusion) -> list[tuple[Floats, Floats]]:
+    """`resample` from the lean mesh, the fine one, and the one that finite strain was solved on."""
+    meshes = [plan.resolution, plan.fine, plan.coarse if plan.finite else plan.resolution]
+    geometry = Geometry(plan.probe, slab, inclusion)
+    return [(cubic(u, x), cubic(v, x)) for u, v in lines_of(geometry, meshes)]
 
 
 def _carried(onto: tuple[Floats, Floats], values: Floats) -> Floats:
-    return np.asarray(onto[0] @ values.reshape(onto[0].shape[1], -1) @ onto[1].T)
+    """Fields (n, cases, 4, k, k) at the nodes of n specimens' meshes on the grid, by matrices (n, m, k)."""
+    left, right = onto
+    return np.asarray(left[:, None, None] @ values @ np.swapaxes(right, 1, 2)[:, None, None])
 
 
 def amplitudes(points: Floats, s: Floats | float) -> tuple[Floats, Floats]:

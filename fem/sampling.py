@@ -18,8 +18,9 @@ the rise both cancel.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from itertools import count, islice
 from typing import Annotated, Literal, TypeVar
 
@@ -230,8 +231,20 @@ def logical_lines(res: Resolution) -> Floats:
 
 def lines(geometry: Geometry, res: Resolution) -> tuple[Floats, Floats]:
     """Real coordinates of a mesh's nodes on the footprint along x and y, mm, each (n,)."""
-    spans, logical = mesh.box_around(geometry).surface, logical_lines(res)
-    return spans[0].lines(logical, res), spans[1].lines(logical, res)
+    return lines_of(geometry, [res])[0]
+
+
+def lines_of(geometry: Geometry, meshes: Sequence[Resolution]) -> list[tuple[Floats, Floats]]:
+    """`lines` of several meshes."""
+    along_x, along_y = mesh.box_around(geometry).surface
+    return [(_line(along_x, res), _line(along_y, res)) for res in meshes]
+
+
+@lru_cache(maxsize=256)  # as `ground.cubic`: where slopes are found, most specimens' lines are the same
+def _line(span: mesh.Span, res: Resolution) -> Floats:
+    found = span.lines(logical_lines(res), res)
+    found.flags.writeable = False
+    return found
 
 
 def geometry_at(plan: Plan, point: Floats, modulus: float) -> Geometry:

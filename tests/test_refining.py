@@ -296,3 +296,21 @@ def test_what_cannot_be_rendered_is_not_explained() -> None:
         CHAIN, features, PRIOR, np.eye(K) * 1e-4, strange, 1.0, np.array([9.0, 6, 80, 0, 0, 0]), render
     )
     assert not found.explains
+
+
+def test_a_turned_prior_is_the_same_and_leaves_the_contact_alone() -> None:
+    """Powers, gain and three depths that go together: three of six unknowns bear on the contact."""
+    depths = [f"press.indentation_mm.{level}" for level in range(3)]
+    names = ["leds.0.flux_W", "specimen.modulus_kPa", "camera.gain_e_per_dn", "specimen.thickness_mm"]
+    names += [*depths, "leds.1.flux_W"]
+    rng = np.random.default_rng(4)
+    free = rng.standard_normal((4000, 6))
+    deeper = free[:, 5:] * [1.0, 2.0, 2.9]
+    table = np.concatenate([free[:, :4], deeper, free[:, 4:5]], axis=1) * 0.01 + 1.0
+    drawn = [{**dict.fromkeys(PARAMETERS, 5.0), **dict(zip(names, row, strict=True))} for row in table]
+    prior = fitting.prior_of(RANGES, drawn)
+    expected = np.cov(table.T)
+    assert np.allclose(prior.basis @ prior.basis.T, expected, atol=1e-9 * expected.max())
+    bright = np.array([name.startswith(("leds.", "camera.")) for name in names])
+    assert (prior.basis[~bright] != 0.0).any(axis=0).sum() == 3
+    assert np.linalg.matrix_rank(prior.basis) == 6

@@ -34,7 +34,7 @@ from twin.complaint import DesignError, shown
 from twin.design import parse_design
 from twin.discrepancy import Discrepancy
 from twin.estimator import Estimator, Sight
-from twin.fitting import Prior
+from twin.fitting import Prior, apart
 
 FORMAT = "tsis-estimator-3"
 _FEATURES = ("mean", "axes", "noise", "spread")
@@ -267,7 +267,7 @@ def _assembled(card: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Estimat
     if shares:
         lights = traced.load(_shipped(shares, "light"))
     chain = Chain(design, emulator, light)
-    return Estimator(card, chain, features, network, prior, arrays["error"], strange, lights, sight)
+    return Estimator(card, chain, features, network, apart(prior), arrays["error"], strange, lights, sight)
 
 
 def _features(arrays: dict[str, NDArray[Any]], start: str, shape: tuple[int, int, int, int]) -> Features:

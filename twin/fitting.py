@@ -33,6 +33,7 @@ _SHARES = (1.0, 0.5, 0.2, 0.05)  # of a step that are tried
 _DAMPED = (1e2, 1e3, 1e4, 1e5)
 """Times the prior's precision that are added to the information for others (Levenberg 1944; [levenberg1944]):
 where means of 100 exposures leave a valley that is thin and bent, no share of the plain step stays in it."""
+_NOTHING = 1e-9  # of a number's spread: rounding
 _AT_END = 1e-9  # of a range: no nearer to its end is told from being there
 
 
@@ -98,7 +99,20 @@ def prior_of(ranges: Floats, drawn: Sequence[Mapping[str, float]]) -> Prior:
     scale = np.maximum(table.std(axis=0), 1e-12)
     values, vectors = np.linalg.eigh(np.cov((table - mean).T / scale[:, None]).reshape(len(names), -1))
     keep = values > 1e-6 * values.max()
-    return Prior(ranges, names, mean, scale[:, None] * vectors[:, keep] * np.sqrt(values[keep]))
+    return apart(Prior(ranges, names, mean, scale[:, None] * vectors[:, keep] * np.sqrt(values[keep])))
+
+
+def apart(prior: Prior) -> Prior:
+    """Return the same prior with as few unknowns as can be that bear on the contact.
+
+    Independent normal numbers stay so when they are turned; here so that what follows the contact's numbers
+    changes only how bright pictures are, for which no press need be worked out (`_inputs`).
+    """
+    order = np.argsort([_bright(name) for name in prior.names], kind="stable")
+    turn = np.linalg.qr(prior.basis[order].T)[0]
+    basis = prior.basis @ turn
+    size = np.linalg.norm(basis, axis=1, keepdims=True)
+    return replace(prior, basis=np.where(np.abs(basis) > _NOTHING * size, basis, 0.0))
 
 
 @dataclass(frozen=True)
