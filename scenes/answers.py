@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from .arrays import floats
+from .arrays import floats, tensor
 from .bsdf import Table
 
 Array = NDArray[np.float64]
@@ -40,7 +40,7 @@ class Answers:
         """From the derivatives of the contact fraction to q parameters, (q, m, m) on cells [iy, ix] of the
         guide's face, and those of the table of T, (n_fraction, n_cos) each, or None."""
         maps = np.ascontiguousarray(np.moveaxis(slopes, 0, -1), dtype=np.float32)
-        texture = mi.Texture2f(mi.TensorXf(maps), wrap_mode=dr.WrapMode.Clamp)
+        texture = mi.Texture2f(tensor(maps), wrap_mode=dr.WrapMode.Clamp)
         flat = (None if one is None else floats(one) for one in tables)
         return Answers(texture, tuple(flat), width_mm)
 

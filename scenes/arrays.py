@@ -30,6 +30,12 @@ def numbers(values: ArrayLike) -> mi.UInt32:
     return mi.UInt32(_aligned(values, np.dtype(np.uint32)))
 
 
+def tensor(values: ArrayLike) -> mi.TensorXf:
+    """On the device, in single precision, in the same shape."""
+    found = np.asarray(values)
+    return mi.TensorXf(floats(found), found.shape)
+
+
 def _aligned(values: ArrayLike, dtype: np.dtype) -> NDArray:
     flat = np.asarray(values).ravel()
     raw = np.empty(flat.size * dtype.itemsize + _ALIGNED, np.uint8)

@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .arrays import floats
+from .arrays import floats, tensor
 from .contact import ContactOptics
 from .tissue import Coupling
 
@@ -51,7 +51,7 @@ class Table:
         top = np.hstack([optics.transmittance, optics.hemispherical[:, None], gain.reshape(rows, -1)])
         packed = np.zeros((rows + len(lobes), top.shape[1]), dtype=np.float32)
         packed[:rows], packed[rows:, :columns], packed[-1, -1] = top, lobes, len(lobes)
-        return mi.TensorXf(packed)
+        return tensor(packed)
 
     def transmittance(self, fraction: mi.Float, cosine: mi.Float, active: mi.Bool | bool = True) -> mi.Float:
         return self.steep(fraction, cosine, active)[0]
@@ -180,7 +180,7 @@ def read_table(filename: str) -> mi.TensorXf:
     if not (np.isfinite(packed).all() and shares.min() >= 0.0 and shares.max() <= 1.0 + 1e-5):
         received = f"{filename!r} with numbers that are no shares of light"
         raise ValueError(f"frustrated_tir: filename: received {received}; allowed 0 to 1")
-    return mi.TensorXf(packed)
+    return tensor(packed)
 
 
 _BINS = 512  # of squared cosine, in which `Table.draw` takes T as constant

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from . import recurrence, trace, transport, wander
-from .arrays import numbers
+from .arrays import numbers, tensor
 from .bsdf import Table
 from .faces import CONTACT, HOUSING, NOTHING, TO_AIR, TO_GLASS, Faces, Meeting
 from .housing import Tally
@@ -106,7 +106,7 @@ class _View:
         """A view that collects so many numbers in each pixel of each LED."""
         rows, columns = film.area_mm2.shape
         stacked = np.concatenate([film.film, film.lean], axis=-1).astype(np.float32)
-        maps = mi.Texture2f(mi.TensorXf(stacked), wrap_mode=dr.WrapMode.Clamp)
+        maps = mi.Texture2f(tensor(stacked), wrap_mode=dr.WrapMode.Clamp)
         layers = dr.zeros(mi.Int64, len(sensor.leds) * rows * columns * many)
         width, middle = _WIDER * sensor.guide.width_mm, _MAP // 2
         spread = (

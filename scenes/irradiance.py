@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
 
-from .arrays import floats
+from .arrays import floats, tensor
 from .aslant import HARMONICS, STEEP
 from .contact import ContactOptics
 from .tissue import Coupling
@@ -166,7 +166,7 @@ def _separated(products: Array, tolerance: float) -> tuple[Array, Array]:
 def look_up(maps: Array, x: mi.Float, y: mi.Float) -> list[mi.Float]:
     """Values of maps (n, m, m), on cells [iy, ix] of the guide's face, at x and y in units of its width."""
     layers = np.ascontiguousarray(np.moveaxis(maps, 0, -1), dtype=np.float32)
-    return list(mi.Texture2f(mi.TensorXf(layers), wrap_mode=dr.WrapMode.Clamp).eval(mi.Point2f(x, y)))
+    return list(mi.Texture2f(tensor(layers), wrap_mode=dr.WrapMode.Clamp).eval(mi.Point2f(x, y)))
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from .arrays import tensor
 from .bsdf import Table
 from .faces import Meeting
 from .sensor import Sensor
@@ -56,7 +57,7 @@ class Spots:
     def of(sensor: Sensor, fraction: NDArray[np.float64], slopes: NDArray[np.float64] | None) -> Spots:
         """From maps [iy, ix] (m, m) and (q, m, m) over the guide's face."""
         maps = [
-            None if one is None else mi.Texture2f(mi.TensorXf(one), wrap_mode=dr.WrapMode.Clamp)
+            None if one is None else mi.Texture2f(tensor(one), wrap_mode=dr.WrapMode.Clamp)
             for one in (
                 fraction[..., None].astype(np.float32),
                 None if slopes is None else np.moveaxis(slopes, 0, -1).astype(np.float32),
@@ -150,7 +151,7 @@ class Relief:
         middles = (np.arange(len(height)) + 0.5) / len(height) * width_mm - width_mm / 2
         slope_y, slope_x = np.gradient(height, middles, middles, edge_order=2)
         stacked = np.stack([height, slope_x, slope_y], axis=-1).astype(np.float32)
-        maps = mi.Texture2f(mi.TensorXf(stacked), wrap_mode=dr.WrapMode.Clamp)
+        maps = mi.Texture2f(tensor(stacked), wrap_mode=dr.WrapMode.Clamp)
         return Relief(maps, width_mm, float(middles[-1]))
 
     def at(self, point: mi.Point3f) -> tuple[mi.Float, mi.Vector3f]:

@@ -42,7 +42,7 @@ def hashes_of(history, convert, values) -> set[int]:
 
 
 @pytest.mark.parametrize("size", [1, 7, 1000])
-@pytest.mark.parametrize("kind", ["floats", "doubles", "numbers"])
+@pytest.mark.parametrize("kind", ["floats", "doubles", "numbers", "tensor"])
 def test_an_address_is_not_in_the_kernel(kind, size, history):
     import mitsuba as mi
 
@@ -52,6 +52,7 @@ def test_an_address_is_not_in_the_kernel(kind, size, history):
         "floats": (arrays.floats, mi.Float, np.float32),
         "doubles": (arrays.doubles, mi.Float64, np.float64),
         "numbers": (arrays.numbers, mi.UInt32, np.uint32),
+        "tensor": (arrays.tensor, mi.TensorXf, np.float32),
     }[kind]
     values = np.arange(3, size + 3).astype(dtype)
     assert len(hashes_of(history, convert, values)) == 1
