@@ -154,9 +154,30 @@ def _squeezed(flow: Tensor) -> Tensor:
     return ((torch.sigmoid(flow * _SCALE) - _EDGE) / (1.0 - 2.0 * _EDGE)).clamp(0.0, 1.0)
 
 
+class DeviceError(ValueError):
+    """Torch cannot run on what was asked for; the message is one line."""
+
+
+def device_of(name: str) -> str:
+    """Return "cpu" or "cuda", for these or "auto": a GPU where torch sees one.
+
+    Raises `DeviceError` for another name, and for "cuda" without a GPU.
+    """
+    if name not in ("auto", "cpu", "cuda"):
+        raise DeviceError(f"device: received {name!r}; allowed: 'auto', 'cpu', 'cuda'")
+    there = torch.cuda.is_available()
+    if name == "cuda" and not there:
+        built = torch.version.cuda or "the CPU"
+        raise DeviceError(
+            f"device: received 'cuda', but torch {torch.__version__}, built for {built}, sees no GPU; "
+            "allowed here: 'auto', 'cpu'"
+        )
+    return "cuda" if there and name != "cpu" else "cpu"
+
+
 @dataclass
 class Training:
-    """A posterior in training, which can be stopped and go on."""
+    """A posterior in training, which can be stopped and go on, on another device, too."""
 
     network: Posterior
     optimiser: torch.optim.Optimizer
@@ -164,20 +185,21 @@ class Training:
     best: float = math.inf
 
     @staticmethod
-    def begin(simulated: Simulated, seed: int, **size: int) -> Training:
-        """Make a network for these features."""
+    def begin(simulated: Simulated, seed: int, device: str = "cpu", **size: int) -> Training:
+        """Make a network for these features, on a device of `device_of`; it begins alike on all."""
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             network = Posterior(simulated.present.shape[1], simulated.unit.shape[1], **size)
         network.spread.copy_(torch.from_numpy(simulated.present.std(axis=0) + np.float32(1.0)))
+        network.to(device)
         return Training(network, torch.optim.AdamW(network.parameters(), lr=1e-3, weight_decay=1e-4))
 
     def state(self) -> dict[str, Tensor]:
-        """Return all tensors that going on needs, by name."""
+        """Return all tensors that going on needs, by name, in the CPU's memory."""
         found = {f"network.{name}": value for name, value in self.network.state_dict().items()}
         for number, one in self.optimiser.state_dict()["state"].items():
             found |= {f"optimiser.{number}.{name}": value for name, value in one.items()}
-        return {name: value.detach().clone() for name, value in found.items()}
+        return _kept(found)
 
     def restore(self, state: Mapping[str, Tensor], said: Mapping[str, Any]) -> None:
         """Go back to `state`, at the step and best loss that ``said`` tells."""
@@ -216,7 +238,7 @@ def train(
     n = len(simulated.unit)
     aside, rest = np.arange(0, n, 20), np.setdiff1d(np.arange(n), np.arange(0, n, 20))
     network = training.network
-    best = best or _state(network)
+    best = best or _kept(network.state_dict())
     began = time.monotonic()
     while training.step < steps and (now := time.monotonic()) < until:
         share = max(training.step / steps, (now - began) / (until - began))
@@ -234,7 +256,7 @@ def train(
                 rng = np.random.default_rng([seed, 2**31])
                 found = float(_loss(network, simulated, np.repeat(aside, 4), rng))
             if found < training.best:
-                training.best, best = found, _state(network)
+                training.best, best = found, _kept(network.state_dict())
             if keep is not None:
                 keep(best)
             if tell is not None:
@@ -246,16 +268,16 @@ def _loss(
     network: Posterior, simulated: Simulated, rows: NDArray[np.integer], rng: np.random.Generator
 ) -> Tensor:
     frames = np.exp(rng.uniform(0.0, math.log(MOST_FRAMES), len(rows))).round().astype(np.float32)
-    told = torch.from_numpy(frames)
-    there = torch.from_numpy(simulated.batch(rows, rng, frames, empty=False))
-    empty = torch.from_numpy(simulated.batch(rows, rng, frames, empty=True))
-    loss = network.loss(torch.from_numpy(simulated.unit[rows]), there, told)
+    there, empty = (simulated.batch(rows, rng, frames, empty=empty) for empty in (False, True))
+    arrays = (frames, there, empty, simulated.unit[rows])
+    told, there, empty, unit = (torch.from_numpy(one).to(network.spread.device) for one in arrays)
+    loss = network.loss(unit, there, told)
     logits = torch.cat([network.presence_logit(there, told), -network.presence_logit(empty, told)])
     return loss + nn.functional.softplus(-logits).mean()
 
 
-def _state(network: nn.Module) -> dict[str, Tensor]:
-    return {name: value.detach().clone() for name, value in network.state_dict().items()}
+def _kept(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {name: value.detach().cpu().clone() for name, value in state.items()}
 
 
 def restored(size: Mapping[str, Any], state: Mapping[str, Tensor]) -> Posterior:

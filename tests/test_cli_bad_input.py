@@ -324,6 +324,7 @@ def twin(*arguments, folder):
         (["simulate", "absent.toml", *FINE[1:]], ["DESIGN", "'absent.toml'"]),
         # Found only once the work is under way: these too are the only line there is.
         ([*FINE, "--device", "cuda"], ["--device", "'cuda'", "allowed"]),
+        (["train", "corpus", "--device", "cuda", "--out", "model"], ["--device", "'cuda'", "allowed"]),
         ([*FINE, "--force", "9", "--quality", "preview"], ["--force", "9.0", "<= about"]),
         (
             [*FINE, "--force", "2", "--quality", "preview", "--mechanics", "linear"],

@@ -279,12 +279,17 @@ def _add_light_flags(parser: Parser) -> None:
     parser.add_argument(
         "--seed", type=whole, default=0, metavar="N", help="of all random numbers (default 0)"
     )
+    add_device(parser, "what the light is computed on")
+
+
+def add_device(parser: Parser, what: str) -> None:
+    """Add the flag for what is computed on a GPU where there is one."""
     parser.add_argument(
         "--device",
         type=choice(*DEVICES),
         default="auto",
         metavar="D",
-        help=", ".join(DEVICES) + " (default auto)",
+        help=f"{what}: {', '.join(DEVICES)} (default auto)",
     )
 
 

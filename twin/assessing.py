@@ -11,7 +11,7 @@ import json
 import os
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -60,6 +60,7 @@ class Task(Sample):
     rendered: bool
     seed: int
     exposures: tuple[int, ...] = FRAMES
+    as_trained: bool = False
 
 
 def assess(
@@ -70,6 +71,7 @@ def assess(
     samples: int | None = None,
     averaged: int | None = None,
     rendered: bool = True,
+    as_trained: bool = False,
     workers: int | None = None,
     seed: int = 0,
     progress: Callable[[str, float], None] = lambda stage, share: None,
@@ -81,6 +83,8 @@ def assess(
     samples : how many at most; of the group "test" where there is one.
     averaged : of how many of these, the first, means of many exposures are answered, too; all by default.
     rendered : whether answers are refined by rendering, too: a minute or two a sample.
+    as_trained : whether a calibrated model is taken as it was before `twin calibrate`: that is right for
+        pictures of its own chain.
 
     Raises
     ------
@@ -97,6 +101,7 @@ def assess(
         "corpus": source.plan.digest,
         "seed": seed,
         "format": 1,
+        **({"as_trained": True} if as_trained else {}),
     }
     _claim(folder, told)
     tasks = [
@@ -108,6 +113,7 @@ def assess(
             rendered,
             seed,
             FRAMES if averaged is None or place < averaged else FRAMES[:1],
+            as_trained,
         )
         for place, number in enumerate(numbers)
     ]
@@ -215,9 +221,10 @@ def _begun(task: Task) -> dict[str, Any]:
 
 
 @lru_cache(maxsize=1)
-def loaded(model: str) -> Estimator:
-    """Return a model, loaded once in a worker process."""
-    return load_estimator(model)
+def loaded(model: str, as_trained: bool = False) -> Estimator:
+    """Return a model, loaded once in a worker process, with its calibration or without."""
+    found = load_estimator(model)
+    return replace(found, calibration=None) if as_trained else found
 
 
 @lru_cache(maxsize=1)
@@ -228,7 +235,7 @@ def opened(corpus: str) -> Corpus:
 
 def answer(task: Task) -> None:
     """Answer one sample and write its record; runs in a worker process."""
-    estimator, source = loaded(task.model), opened(task.corpus)
+    estimator, source = loaded(task.model, task.as_trained), opened(task.corpus)
     plan = source.plan
     levels = levels_of(source, estimator)
     values = values_of(source, estimator, task.number, levels)

@@ -97,7 +97,7 @@ def main(argv: list[str] | None = None) -> int:
     except ValueError as error:
         if not type(error).__module__.startswith(_ROOMS):  # a mistake of this program: show where
             raise
-        return _fail(name, str(error), 1 if isinstance(error.__cause__, OSError) else 2)
+        return _fail(name, _with_flags(str(error)), 1 if isinstance(error.__cause__, OSError) else 2)
 
 
 def _left_by(verb: str) -> str:

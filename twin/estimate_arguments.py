@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from twin.arguments import add_verb, number, whole
+from twin.arguments import add_device, add_verb, number, whole
 
 _TRAIN = """\
 Learn from a corpus to tell an inclusion's size, depth and modulus from pictures, with how sure that is, and
@@ -16,6 +16,7 @@ them, in MODEL.parts: the same command goes on with it, also after Ctrl-C.
 examples:
   twin train corpora/train --out models/tsis
   twin train corpora/train --levels 0 2 --minutes 40 --seed 1 --out models/two-levels
+  twin train corpora/train --device cuda --out models/tsis
 """
 
 _ASSESS = """\
@@ -31,6 +32,7 @@ examples:
   twin assess models/tsis corpora/pictures --averaged 100 --out assessed
   twin assess models/tsis corpora/pictures --quick --out quick
   twin assess models/tsis corpora/solved --samples 20 --out mismatch
+  twin assess tsis corpora/held-out --as-trained --out matched
   twin assess models/tsis corpora/pictures --curve --out assessed
 """
 
@@ -95,6 +97,7 @@ def add(verbs: Any) -> None:
         "--imagined", type=whole, metavar="N", help="specimens that the network is shown (default 16000)"
     )
     train.add_argument("--seed", type=whole, default=0, metavar="N", help="of all random numbers (default 0)")
+    add_device(train, "what the network is trained on")
     _add_lean(train)
 
     assess = add_verb(verbs, "assess", "how well a model tells inclusions that it has not seen", _ASSESS)
@@ -114,6 +117,11 @@ def add(verbs: Any) -> None:
         help="instead: how well light learned from 40, 80, ... of the corpus's samples does",
     )
     assess.add_argument("--quick", action="store_true", help="the network alone, without rendering")
+    assess.add_argument(
+        "--as-trained",
+        action="store_true",
+        help="a calibrated model as it was before twin calibrate, for pictures of its own chain",
+    )
     assess.add_argument("--workers", type=whole, metavar="N", help="processes (default: one for each core)")
     assess.add_argument(
         "--seed", type=whole, default=0, metavar="N", help="of all random numbers (default 0)"

@@ -36,6 +36,7 @@ def _train(arguments: argparse.Namespace) -> int:
             imagined=arguments.imagined,
             seed=arguments.seed,
             lean=arguments.lean,
+            device=arguments.device,
             progress=report,
         )
     print(written)
@@ -79,12 +80,15 @@ def _assess(arguments: argparse.Namespace) -> int:
             ("--samples", arguments.samples),
             ("--averaged", arguments.averaged),
             ("--quick", arguments.quick),
+            ("--as-trained", arguments.as_trained),
             ("--workers", arguments.workers),
             ("--seed", arguments.seed),
         ):
             if given:
                 raise DesignError(
-                    flag, "it with --curve", "none of --samples, --averaged, --quick, --workers, --seed"
+                    flag,
+                    "it with --curve",
+                    "none of --samples, --averaged, --quick, --as-trained, --workers, --seed",
                 )
         with Reporter() as report:
             told = learning_curve.curve(arguments.model, arguments.corpus, arguments.out, progress=report)
@@ -98,6 +102,7 @@ def _assess(arguments: argparse.Namespace) -> int:
             arguments.out,
             samples=arguments.samples,
             averaged=arguments.averaged,
+            as_trained=arguments.as_trained,
             rendered=not arguments.quick,
             workers=arguments.workers,
             seed=arguments.seed,

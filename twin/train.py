@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 import fem
 from estimation import light_map
 from estimation.features import Features, compress
-from estimation.posterior import MOST_FRAMES, Simulated, Training, restored
+from estimation.posterior import MOST_FRAMES, Simulated, Training, device_of, restored
 from estimation.posterior import train as train_network
 from scenes import traced
 from twin import assess, likeness
@@ -97,6 +97,7 @@ def train(
     samples: int | None = None,
     workers: int | None = None,
     lean: bool = False,
+    device: str = "auto",
     progress: Progress | None = None,
 ) -> str:
     """Train an estimator on a corpus, write it as OUT.safetensors and OUT.json, and say how well it does.
@@ -108,13 +109,17 @@ def train(
     imagined : specimens that it is trained on, 100 or more; by default `IMAGINED`.
     samples : of the corpus that the light map is learned from, at most; all by default.
     lean : as of `twin.estimator_file.save_estimator`.
+    device : what the network is trained on, as of `estimation.posterior.device_of`.
 
     Raises
     ------
     DesignError
         In one line, for a corpus that cannot teach this.
+    DeviceError
+        In one line, for a device that is not there.
     """
     tell, imagined = progress or (lambda stage, share: None), imagined or IMAGINED
+    device = device_of(device)
     source, place = Corpus(corpus), Path(f"{out}.safetensors")
     parts = place.with_name(place.name.removesuffix(".safetensors") + ".parts")
     plan = source.plan
@@ -160,7 +165,7 @@ def train(
     key = hashlib.sha256(
         repr((plan.digest, chosen, seed, imagined, samples, versions())).encode() + told.present.tobytes()
     ).hexdigest()[:16]
-    network = _network(told, parts / f"{key}.safetensors", minutes, seed, tell)
+    network = _network(told, parts / f"{key}.safetensors", minutes, seed, device, tell)
     estimator = Estimator(
         {
             "name": place.name.removesuffix(".safetensors"),
@@ -344,10 +349,10 @@ def likeness_of(
     return dict(likeness.learn(seen[:, :, 0], seen[:, :, 1], chain.design.camera, BLOCK[0], seed))
 
 
-def _network(told: Simulated, place: Path, minutes: float, seed: int, tell: Progress) -> Any:
+def _network(told: Simulated, place: Path, minutes: float, seed: int, device: str, tell: Progress) -> Any:
     """Train the network, from where it was left."""
-    training = Training.begin(told, seed)
-    best = {name: value.clone() for name, value in training.network.state_dict().items()}
+    training = Training.begin(told, seed, device)
+    best: dict[str, torch.Tensor] | None = None
     memory = place.with_suffix(".json")
     spent = 0.0
     if place.is_file() and memory.is_file():
