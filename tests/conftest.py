@@ -5,15 +5,13 @@ from pathlib import Path
 
 import pytest
 
-from scenes import backend
-
 # Pictures are drawn without a display, and the sums of a test do not depend on how many cores a machine has.
 os.environ["MPLBACKEND"] = "Agg"
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-if (
-    os.environ.get("TWIN_DEVICE") == "cuda"
-):  # what tests ask of the CPU is computed on the GPU, in this process
+if os.environ.get("TWIN_DEVICE") == "cuda":  # what tests ask of the CPU is computed on the GPU
+    from scenes import backend
+
     backend.VARIANTS["cpu"], settle = backend.VARIANTS["cuda"], backend._settle
     backend._settle = lambda device, variants: settle("cuda", variants)
 
