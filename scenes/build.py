@@ -180,7 +180,7 @@ def _contact_mesh(sensor: Sensor, table: mi.TensorXf) -> mi.Mesh:
 
 def _fraction(sensor: Sensor, deformed: surface.OpticalSurface) -> np.ndarray:
     fraction = real_contact(deformed.pressure_kPa, sensor.skin, sensor.effective_modulus_kPa)
-    return surface.with_skirt(fraction)
+    return surface.with_skirt(deformed, fraction)
 
 
 def _dielectric(inside: float, outside: float) -> dict[str, Any]:

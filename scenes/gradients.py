@@ -308,7 +308,7 @@ def _hang(renderer: Renderer, pressed: OpticalSurface, move: _Moves, step: mi.Fl
     """Let the scene's surface hang on a step of a parameter."""
     build.put_surface(renderer.scene, renderer.sensor, pressed)
     parameters = mi.traverse(renderer.scene)
-    changes = {"vertex_contact_fraction": surface.with_skirt(move.fraction)}
+    changes = {"vertex_contact_fraction": surface.with_skirt(pressed, move.fraction)}
     if move.displacement_mm is not None:
         low, high = (surface.triangulate(one) for one in _beside(pressed, move.displacement_mm))
         per = _per(move.displacement_mm)

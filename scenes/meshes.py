@@ -30,7 +30,7 @@ def bodies(sensor: Sensor, deformed: surface.OpticalSurface) -> dict[str, trimes
         "displacement_z": deformed.displacement_mm[..., 2],
     }
     for name, values in fields.items():
-        top.vertex_attributes[name] = surface.with_skirt(values).astype(np.float32)
+        top.vertex_attributes[name] = surface.with_skirt(deformed, values).astype(np.float32)
     box = trimesh.creation.box(extents=(guide.width_mm, guide.width_mm, glass.thickness_mm))
     box.apply_translation((0.0, 0.0, -guide.thickness_mm - glass.thickness_mm / 2))
     return {"guide": _closed(top, -guide.thickness_mm), "contact": top, "glass": box}

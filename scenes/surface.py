@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -137,13 +138,17 @@ def flat(width_mm: float, pressure_kPa: float, *, nodes: int = NODES) -> Optical
 def triangulate(surface: OpticalSurface) -> trimesh.Trimesh:
     """Deformed triangles, (n + 2)² vertices in row-major [iy, ix] order, normals towards the guide.
 
-    The scene's side walls are flat, so what bulges beyond them (0.1 mm) is pressed back, and an outermost
-    ring closes the gap where the surface recedes. Both keep the normals of the surface as it is.
+    The scene's side walls are flat, so what bulges beyond them (0.3 mm) is cut off: the mesh ends where the
+    surface passes the wall, whichever nodes that lies between. An outermost ring closes the gap where the
+    surface recedes.
     """
     lines = surface.nodes_mm
     x, y = np.meshgrid(lines, lines)
     position = np.stack([x, y, surface.rest_mm], axis=-1) + surface.displacement_mm
     normals = _normals(position)
+    position[..., 2], *parts = _within_walls(surface, [position[..., 2], *np.moveaxis(normals, -1, 0)])
+    normals = np.stack(parts, axis=-1)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     position = np.pad(position, ((1, 1), (1, 1), (0, 0)), mode="edge")
     # rising, so that no triangle degenerates: 0.1 µm is the least at which single precision still tells
     # where in a triangle a point lies
@@ -155,22 +160,37 @@ def triangulate(surface: OpticalSurface) -> trimesh.Trimesh:
         position[..., axis] = np.clip(position[..., axis], inward, outward)
         edge = np.moveaxis(position[..., axis], 1 - axis, 0)
         edge[0], edge[-1] = -limit[-1], limit[-1]
+    ring = np.pad(normals, ((1, 1), (1, 1), (0, 0)), mode="edge").reshape(-1, 3)
     return trimesh.Trimesh(
-        position.reshape(-1, 3), _faces(lines.size + 2), vertex_normals=normals, process=False
+        position.reshape(-1, 3), _faces(lines.size + 2), vertex_normals=ring, process=False
     )
 
 
+def _within_walls(surface: OpticalSurface, fields: Sequence[Array]) -> list[Array]:
+    """Fields (n, n) at the grid's points, but where these bulge beyond the walls at those of the surface that
+    lie in the wall there."""
+    lines, found = surface.nodes_mm, [np.array(values) for values in fields]
+    place = np.stack(np.meshgrid(lines, lines), axis=-1) + surface.displacement_mm[..., :2]
+    inside = np.clip(place, lines[0], lines[-1])
+    beyond = (inside != place).any(axis=-1)
+    if beyond.any():
+        told = _look_up(lines, np.stack(found), _undeformed(surface, inside[beyond]))
+        for values, new in zip(found, told, strict=True):
+            values[beyond] = new
+    return found
+
+
 def _normals(position: Array) -> Array:
-    """Unit normals towards the guide of a grid of points (n, n, 3), with the skirt's ring: ((n + 2)², 3)."""
+    """Unit normals towards the guide of a grid of points (n, n, 3), (n, n, 3)."""
     along_y, along_x = np.gradient(position, axis=(0, 1), edge_order=2)
     normals = np.cross(along_y, along_x)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    return np.asarray(np.pad(normals, ((1, 1), (1, 1), (0, 0)), mode="edge").reshape(-1, 3))
+    return np.asarray(normals)
 
 
-def with_skirt(values: Array) -> Array:
-    """Vertex values (n, n) extended to the skirt's ring, flattened in the order of `triangulate`."""
-    return np.asarray(np.pad(values, 1, mode="edge").ravel())
+def with_skirt(surface: OpticalSurface, values: Array) -> Array:
+    """Values (n, n) at the grid's points as those of the vertices of `triangulate`, in their order."""
+    return np.asarray(np.pad(_within_walls(surface, [values])[0], 1, mode="edge").ravel())
 
 
 def _faces(n: int) -> NDArray[np.int64]:
