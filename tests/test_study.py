@@ -35,6 +35,7 @@ def with_field(field, text):
 
 def test_the_shipped_studies():
     assert shipped_studies() == [
+        "held-out",
         "paper",
         "paper-quick",
         "phantoms",
