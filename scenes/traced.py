@@ -11,7 +11,7 @@ the same function of the press every time, so that pictures can be compared and 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -35,7 +35,6 @@ _STRESS = 3.0  # what inclusions change is so much of what presses change, times
 _FEWEST = 40  # presses
 _COARSE = 50  # cells per side on which modes are kept, and contact fraction is looked at
 _FINE = 100  # on which their mean is
-_PATTERN, _SMALL = 25, 0.1  # cells per side of patterns that tell what pictures show; over the light
 _NARROWEST = 1e-4  # of a kernel: less would be no number by the time it is squared
 _BEYOND = 2.0  # how far inputs may leave what was learned, times its reach
 FORMAT = "tsis-traced-4"
@@ -174,7 +173,6 @@ def learn(
     sensor: Sensor,
     descriptions: Sequence[NDArray[np.floating]],
     traced: Iterable[NDArray[np.floating]],
-    shares: Array | None = None,
 ) -> TracedLight:
     """Learn from presses of one sensor, in pairs: with an inclusion and without, by the same light paths.
 
@@ -182,7 +180,6 @@ def learn(
     ----------
     descriptions : (n, d) from `describe`.
     traced : n maps (n_led, layers, g, g), W/mm², `Rendering.traced` of one band; taken one by one.
-    shares : (layers,) of `shown`, by which maps weigh in the choice of modes; all alike by default.
     """
     n = len(descriptions)
     if n < _FEWEST or n % 2:
@@ -219,14 +216,11 @@ def learn(
     weigh = kriging.weights(kernel, nodes, np.eye(n), noise)
     smooth = kernel.terms(nodes, nodes) @ weigh
     told = np.concatenate([smooth[1::2], _STRESS * (smooth[::2] - smooth[1::2])]).astype(np.float32)
-    heavy = flat
-    if shares is not None:
-        heavy = flat * np.tile(np.repeat(shares**2, _COARSE**2), len(sensor.leds)).astype(np.float32)
-    values, vectors = np.linalg.eigh(np.asarray(told @ (heavy @ flat.T) @ told.T, np.float64))
+    values, vectors = np.linalg.eigh(np.asarray(told @ (flat @ flat.T) @ told.T, np.float64))
     first = np.argsort(values)[::-1][:_MODES]
     first = first[values[first] > 1e-10 * values[first[0]]]
     modes = (vectors[:, first].T.astype(np.float32) @ told) @ flat
-    amounts = heavy @ modes.T / values[first]
+    amounts = flat @ modes.T / values[first]
     largest = np.abs(modes).max(axis=1)
     modes /= largest[:, None]
     return TracedLight(
@@ -240,30 +234,6 @@ def learn(
         modes.astype(np.float16).astype(np.float32).reshape(-1, *coarse.shape[1:]),
         100.0 * float(np.sqrt(np.mean(missed**2))),
     )
-
-
-def shown(picture: Callable[[Single], NDArray[np.floating]], maps: Single) -> Array:
-    """How much pictures show of each map, (layers,): what a pattern on it changes of a picture over the
-    pattern, both root mean square, at most 1.
-
-    Of the maps that light is weighted on, some matter ten or a hundred times as much as others that hold as
-    much light: those of directions from which the tissue gives little back towards the camera.
-
-    Parameters
-    ----------
-    picture : of traced light (n_led, layers, g, g), linear in it.
-    maps : such light, about which patterns are put.
-    """
-    plain, found = np.asarray(picture(maps), np.float64), np.zeros(maps.shape[1])
-    patterns = np.random.Generator(np.random.Philox(0)).standard_normal((len(maps), _PATTERN, _PATTERN))
-    pattern = finer(patterns, maps.shape[-1])
-    for layer in range(maps.shape[1]):
-        size = np.sqrt(np.mean(maps[:, layer].astype(np.float64) ** 2))
-        if size > 0.0:
-            put = np.array(maps)
-            put[:, layer] += (_SMALL * size * pattern).astype(maps.dtype)
-            found[layer] = np.sqrt(np.mean((picture(put) - plain) ** 2)) / size
-    return found / max(float(found.max()), 1e-30)
 
 
 def _principal(rows: Array, count: int) -> Array:

@@ -28,7 +28,6 @@ from twin.pooled import each
 from twin.stage import check_file, staged_file
 
 if TYPE_CHECKING:
-    from scenes import SpectralRenderer
     from scenes.traced import TracedLight
 
 PRESSES = 384
@@ -106,9 +105,7 @@ def learn_light(
     files = [path for task in tasks for path in _files(task)]
     told = [_array(path, "description") for path in files]
     light = tuple(
-        traced.learn(
-            sensor, told, (_array(path, f"traced.{number}") for path in files), _shown(tasks[0], number)
-        )
+        traced.learn(sensor, told, (_array(path, f"traced.{number}") for path in files))
         for number, (_, _, sensor) in enumerate(sensors)
     )
     with staged_file(out, "out", ".npz") as place:
@@ -166,10 +163,14 @@ def tasks_of(
 
 def trace(task: Task) -> None:
     """Trace a press and write its description and traced light; runs in a worker process."""
-    from scenes import surface, traced, transport
+    from scenes import SpectralRenderer, surface, traced, transport
     from twin.labour import give_back
+    from twin.sample import _emulator
 
-    press, renderer = _pressed(task), _renderer(task)
+    press = presses.emulated(task.design, task.inclusion, [task.depth_mm], _emulator(task.emulator))[0]
+    renderer = SpectralRenderer(
+        task.design.sensor(), count=task.design.light.bands, at=task.design.sensor, device="cpu"
+    )
     for field, path in zip(("pressure", "pressure_0"), _files(task), strict=True):
         if _of(task, path):
             continue
@@ -190,24 +191,6 @@ def trace(task: Task) -> None:
     give_back()
 
 
-def _shown(task: Task, number: int) -> NDArray[np.float64]:
-    """How much pictures of a press show of each map of a band (`scenes.traced.shown`)."""
-    from scenes import traced, transport
-    from scenes.cells import finer
-    from twin.labour import give_back
-
-    renderer, press = _renderer(task).renderers[number], _pressed(task)
-
-    def picture(maps: NDArray[np.float32]) -> NDArray[np.float32]:
-        light = (maps.astype(np.float64),)
-        return renderer.render(press.surface, quality="preview", traced=light).radiance.sum(axis=0)
-
-    maps = _array(task.place, f"traced.{number}")
-    found = traced.shown(picture, finer(maps, transport.GRID))
-    give_back()
-    return found
-
-
 def summary(light: tuple[TracedLight, ...], out: str) -> str:
     """Return what a person wants to know of learned light, several lines."""
     lines = [
@@ -216,20 +199,6 @@ def summary(light: tuple[TracedLight, ...], out: str) -> str:
         for one in light
     ]
     return "\n".join([*lines, f"file: {out}"])
-
-
-def _pressed(task: Task) -> fem.Emulated:
-    from twin.sample import _emulator
-
-    return presses.emulated(task.design, task.inclusion, [task.depth_mm], _emulator(task.emulator))[0]
-
-
-def _renderer(task: Task) -> SpectralRenderer:
-    from scenes import SpectralRenderer
-
-    return SpectralRenderer(
-        task.design.sensor(), count=task.design.light.bands, at=task.design.sensor, device="cpu"
-    )
 
 
 def _files(task: Task) -> list[Path]:
