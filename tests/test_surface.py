@@ -187,7 +187,7 @@ def test_vertex_normals_are_those_of_the_surface_up_to_the_rim() -> None:
 
 def test_a_bulging_rim_is_cut_off_where_it_passes_the_wall() -> None:
     """Heights and pressures of vertices are those of the surface there, however the nodes lie about the wall;
-    were nodes beyond it only pressed back, they would be 0.02 to 0.06 mm too low there, and the last facet the
+    were nodes beyond it only pressed back, they would be 0.02 to 0.06 mm too low there, the last facet the
     steeper the nearer the next node is to the wall."""
     for bulge in (0.12, 0.25, 0.259, 0.262, 0.4):  # nodes are 0.13 mm apart
         surface = shaped(
