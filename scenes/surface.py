@@ -181,11 +181,10 @@ def _within_walls(surface: OpticalSurface, fields: Sequence[Array]) -> list[Arra
 
 
 def _normals(position: Array) -> Array:
-    """Unit normals towards the guide of a grid of points (n, n, 3), (n, n, 3)."""
+    """Unit normals (n, n, 3), towards the guide, of a grid of points (n, n, 3)."""
     along_y, along_x = np.gradient(position, axis=(0, 1), edge_order=2)
     normals = np.cross(along_y, along_x)
-    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    return np.asarray(normals)
+    return np.asarray(normals / np.linalg.norm(normals, axis=-1, keepdims=True))
 
 
 def with_skirt(surface: OpticalSurface, values: Array) -> Array:
