@@ -166,7 +166,7 @@ def test_an_answer_that_is_kept_is_not_made_again(tmp_path: Path, monkeypatch: p
         parameters=lambda number: {}, inclusion=lambda number: None, base=base, indentation_mm=(1.0,)
     )
     for name, value in (
-        ("loaded", lambda model: estimator),
+        ("loaded", lambda model, as_trained: estimator),
         ("opened", lambda corpus: SimpleNamespace(plan=plan)),
         ("levels_of", lambda source, estimator: [0]),
         ("stored", lambda *asked: np.zeros(3)),
@@ -308,3 +308,11 @@ def test_information_of_the_scalars_is_that_of_noisy_pictures() -> None:
     variance = np.full((1, 4, 5), sd**2 / (side[0] * side[1]))
     told = ablation._scalars(coarse[None], coarse[None, None], variance, threshold)
     assert told[0, 0] == pytest.approx(expected, rel=0.08)
+
+
+def test_a_calibrated_model_can_be_taken_as_it_was_trained() -> None:
+    """And its answers are kept apart from those of the model as it is."""
+    calibrated, trained = (assessing.loaded("tsis", as_trained) for as_trained in (False, True))
+    assert calibrated.calibration is not None and trained.calibration is None
+    assert np.array_equal(calibrated.features.axes, trained.features.axes)
+    assert trained.sight.discrepancy is None

@@ -162,11 +162,11 @@ def test_train_takes_its_arguments(monkeypatch, capsys):
     module.train = lambda corpus, out, **options: called.update(corpus=corpus, out=out, **options) or "done"
     monkeypatch.setitem(sys.modules, "twin.train", module)
     flags = ["--levels", "0", "2", "--minutes", "0.5", "--seed", "4", "--samples", "40", "--imagined", "500"]
-    flags += ["--lean"]
+    flags += ["--lean", "--device", "cpu"]
     assert cli.main(["train", "c", "--out", "m", *flags]) == 0
     del called["progress"]
     numbers = {"levels": [0, 2], "minutes": 0.5, "seed": 4, "samples": 40, "imagined": 500, "lean": True}
-    assert called == {"corpus": "c", "out": "m", **numbers}
+    assert called == {"corpus": "c", "out": "m", "device": "cpu", **numbers}
     assert capsys.readouterr().out == "done\n"
     for wrong, word in (
         (["train", "c"], "--out"),
