@@ -44,7 +44,7 @@ def run(
         "TWIN_LLVM_DIRS": str(folder),
         "LD_LIBRARY_PATH": str(folder),
         "XDG_CACHE_HOME": str(folder / "cache"),
-        "PYTHONPATH": str(ROOT),
+        "PYTHONPATH": os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH")))),
     }
     return subprocess.run(
         [sys.executable, "-c", program, device],
