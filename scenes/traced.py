@@ -38,16 +38,19 @@ _FINE = 100  # on which their mean is
 _NARROWEST = 1e-4  # of a kernel: less would be no number by the time it is squared
 _BEYOND = 2.0  # how far inputs may leave what was learned, times its reach
 FORMAT = "tsis-traced-4"
-LIGHT = 14
+LIGHT = 15
 """Counts up when pictures of the same press change: what was learned or kept before is of no use then.
 9: windows of other LEDs in painted walls, thin sheets that hardly scatter; 10: tissue whose scatterings
 favour a direction (see `version`); 11: half the noise, so that pictures and references go together; 12: less
 noise of LEDs together, likewise; 13: what tissue gives back under a bent contact, and narrower smoothing, by
 which references of light learned before are 0.1 % off; 14: a bulging rim is cut off where it passes the wall,
-by which light learned before is up to 0.8 % off beside the rim."""
+by which light learned before is up to 0.8 % off beside the rim; 15: learned light on finer cells keeps its
+means."""
 BIAS_SINCE = 13
 """The first light of which a quality's measured bias holds (`assets/light_bias.json`); later ones' too, as
 long as what they change is common to all qualities, or less than the bias is known to."""
+PRESSES_SINCE = 14
+"""The first light of which presses that were traced to learn from hold; later ones' too, as above."""
 ARRAYS = ("centre", "axes", "nodes", "weights", "kernel", "mean", "modes")
 """Fields of `TracedLight` that are arrays."""
 
@@ -112,8 +115,8 @@ class TracedLight:
         kernel = kriging.Kernel(int(self.kernel[0]), *(float(one) for one in self.kernel[1:]))
         amounts = (kernel.terms(inputs[None], self.nodes)[0] @ self.weights).astype(np.float32)
         cells = cells or fraction.shape[0]
-        found = finer(self.mean, cells)
-        found += finer(np.tensordot(amounts, self.modes, 1), cells)
+        found = finer(self.mean, cells, means=True)
+        found += finer(np.tensordot(amounts, self.modes, 1), cells, means=True)
         found *= np.array([led.flux_W for led in sensor.leds], np.float32)[:, None, None, None]
         return found
 

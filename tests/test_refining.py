@@ -314,3 +314,26 @@ def test_a_turned_prior_is_the_same_and_leaves_the_contact_alone() -> None:
     bright = np.array([name.startswith(("leds.", "camera.")) for name in names])
     assert (prior.basis[~bright] != 0.0).any(axis=0).sum() == 3
     assert np.linalg.matrix_rank(prior.basis) == 6
+
+
+@pytest.mark.parametrize(
+    "nodes",
+    [
+        # of pictures of (9, 5.5, 80), whose spline rose again towards 120 kPa, and of a steep start
+        [(52.8, -4.47), (68.0, -0.84), (83.1, 0.0), (120.0, -0.63)],
+        [(70.4, -1983.0), (77.7, -549.0), (79.5, -136.0), (84.9, -51.6), (99.4, 0.0), (120.0, -0.36)],
+    ],
+)
+def test_between_moduli_the_density_is_not_beyond_theirs(nodes):
+    moduli, logs = np.array(nodes).T
+    points = np.insert(np.tile([9.0, 5.5, 1.0, -0.5, 0.0], (len(moduli), 1)), 2, moduli, axis=1)
+    found = refining.Valley(moduli, logs, points, np.tile(1e-4 * np.eye(4), (len(moduli), 1, 1)))
+    drawn = found.draw(PRIOR, 40000, 0)[:, 2]
+    density, edges = np.histogram(drawn, 40, (moduli[0], moduli[-1]), density=True)
+    log = np.log(np.maximum(density, 1e-12))
+    top = log.max()
+    right = log[(edges[1:] > 100.0)]
+    assert np.polyfit(np.arange(len(right)), right, 1)[0] < 0.0
+    for low, high, left, right in zip(moduli[:-1], moduli[1:], logs[:-1], logs[1:], strict=True):
+        inside = (edges[:-1] >= low) & (edges[1:] <= high) & (density > 0.0)
+        assert (log[inside] - top < max(left, right) - logs.max() + 0.15).all()

@@ -255,7 +255,7 @@ def test_presses_traced_for_an_earlier_light_or_another_design_are_traced_anew(t
     camera = replace(task.design, name="another")
     for other in (replace(task, depth_mm=1.0), replace(task, design=camera)):
         assert not learn_light._kept(other)
-    monkeypatch.setattr(traced, "LIGHT", traced.LIGHT + 1)
+    monkeypatch.setattr(traced, "PRESSES_SINCE", traced.PRESSES_SINCE + 1)
     assert not learn_light._kept(task)
     np.savez(task.place, **arrays)  # of a version that left no mark
     assert not learn_light._kept(task)

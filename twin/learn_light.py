@@ -207,10 +207,10 @@ def _files(task: Task) -> list[Path]:
 
 def _mark(task: Task) -> str:
     """What decides a press's light: files of another design or an earlier version are traced anew."""
-    from scenes.traced import LIGHT
+    from scenes.traced import PRESSES_SINCE
 
     luminaires = tuple(ies.digest(led.ies) for led in task.design.leds if led.ies is not None)
-    told = (LIGHT, task.design, task.inclusion, task.depth_mm, task.seed, *luminaires)
+    told = (PRESSES_SINCE, task.design, task.inclusion, task.depth_mm, task.seed, *luminaires)
     return hashlib.sha256(repr(told).encode()).hexdigest()[:16]
 
 

@@ -14,11 +14,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, stats
-from scipy.interpolate import CubicSpline, interp1d
+from scipy.interpolate import CubicHermiteSpline, CubicSpline, interp1d
 
 from estimation.features import Features
 from twin.chain import Chain
@@ -57,7 +58,10 @@ _REACH = 1.5  # standard deviations to the next modulus, as the fit has them: it
 _SMALL = 0.02  # of that way: no side to go to
 _ENOUGH, _FAR = 3.0, 4.5  # falls of the log density: that need not be passed, and that is aimed at
 _STEEP = 2.0  # a fall from one modulus to the next that asks for one between
+_UNSURE = 0.02  # of the probability, that splines differ by between two moduli: asks for one between
+_NOTHING = 12.0  # a fall of the log density that more would not make less probable
 _NODES = 9  # moduli at most
+_LIKELIER = 1.0  # at most, than the most probable modulus that was looked at
 _FINE = 800  # moduli in between
 _HELD = 2  # the modulus, among `PARAMETERS`
 
@@ -234,17 +238,34 @@ class Valley:
         """Return samples (count, 5)."""
         rng = np.random.default_rng([seed, 11])
         modulus = self._quantile(rng.random(count))
-        others = CubicSpline(self.modulus_kPa, np.delete(self.points[:, :5], _HELD, axis=1))(modulus)
-        roots = interp1d(self.modulus_kPa, np.linalg.cholesky(self.spread), axis=0)(modulus)
+        at, nodes = _stiffness(modulus), _stiffness(self.modulus_kPa)
+        others = _even(nodes, np.delete(self.points[:, :5], _HELD, axis=1))(at)
+        roots = interp1d(nodes, np.linalg.cholesky(self.spread), axis=0)(at)
         others += np.einsum("nij,nj->ni", roots, rng.standard_normal(others.shape))
         drawn = np.insert(others, _HELD, modulus, axis=1)
         return np.clip(drawn, prior.ranges[:, 0], prior.ranges[:, 1])
 
     def _quantile(self, shares: Floats) -> Floats:
         fine = np.linspace(self.modulus_kPa[0], self.modulus_kPa[-1], _FINE)
-        logs = np.minimum(CubicSpline(self.modulus_kPa, self.log_density)(fine), self.log_density.max() + 0.5)
-        below = np.cumsum(np.exp(logs - logs.max()))
-        return np.asarray(np.interp(shares, below / below[-1], fine))
+        below = np.cumsum(_density(_even, self.modulus_kPa, self.log_density, fine))
+        return np.asarray(np.interp(shares, below, fine))
+
+
+def _stiffness(modulus_kPa: Floats) -> Floats:
+    """What the valley is even in: an inclusion shows by how little it gives, which ends at a rigid one's."""
+    return -1.0 / modulus_kPa
+
+
+def _even(x: Floats, y: Floats) -> CubicHermiteSpline:
+    """A cubic spline through nodes x (m,) of y (m, ...) whose slope there is at most twice the lesser of those
+    to the nodes beside (Hyman 1983, eq. 2.3; [hyman1983]). Others sway where nodes are far apart, which would
+    pass for a second most probable modulus."""
+    chords = (np.diff(y, axis=0).T / np.diff(x)).T
+    before, after = np.concatenate([chords[:1], chords]), np.concatenate([chords, chords[-1:]])
+    most = 2.0 * np.minimum(np.abs(before), np.abs(after))
+    slopes = np.clip(CubicSpline(x, y)(x, 1), -most, most)
+    turned = (before * after > 0.0) & (slopes * before < 0.0)
+    return CubicHermiteSpline(x, y, np.where(turned, 0.0, slopes))
 
 
 @dataclass(frozen=True)
@@ -326,7 +347,7 @@ def valley(
             if away >= room:
                 break
             away = min(away * float(np.clip(np.sqrt(_FAR / max(fall, 0.1)), 1.5, 4.0)), room)
-    while len(found) < _NODES and (between := _steep(found)) is not None:
+    while len(found) < _NODES and (between := _unsure(found)) is not None:
         visit(between)
     moduli = sorted(found)
     return (
@@ -340,16 +361,31 @@ def valley(
     )
 
 
-def _steep(found: Mapping[float, _Node]) -> float | None:
-    """The middle of the two neighbours between which the density falls most, counted less away from the top;
-    None where it falls little everywhere."""
-    moduli = sorted(found)
+def _unsure(found: Mapping[float, _Node]) -> float | None:
+    """The middle of the two neighbours between which the density falls most, counted less away from the top,
+    or else splines differ most on how probable moduli are; None where it falls little and they agree."""
+    moduli = np.array(sorted(found))
     logs = np.array([found[one].log_density for one in moduli])
-    falls = np.abs(np.diff(logs)) - 2.0 * (logs.max() - np.maximum(logs[1:], logs[:-1]))
-    if len(falls) == 0 or falls.max() < _STEEP:
+    if len(moduli) < 2:
         return None
-    place = int(falls.argmax())
-    return 0.5 * (moduli[place] + moduli[place + 1])
+    known = np.maximum(logs - logs.max(), -_NOTHING)
+    doubt = (np.abs(np.diff(known)) + 2.0 * np.maximum(known[1:], known[:-1])) / _STEEP
+    if doubt.max() < 1.0:
+        fine = np.linspace(moduli[0], moduli[-1], _FINE)
+        density = [_density(spline, moduli, logs, fine) for spline in (_even, CubicSpline)]
+        between = np.searchsorted(moduli[1:-1], fine)
+        doubt = np.bincount(between, np.abs(density[1] - density[0]), len(moduli) - 1) / _UNSURE
+    if doubt.max() < 1.0:
+        return None
+    place = int(doubt.argmax())
+    return float(0.5 * (moduli[place] + moduli[place + 1]))
+
+
+def _density(spline: Callable[[Floats, Floats], Any], moduli: Floats, logs: Floats, fine: Floats) -> Floats:
+    """Probabilities (n,) of moduli, by a spline through the log density at some."""
+    known = np.maximum(logs - logs.max(), -_NOTHING)
+    found = np.exp(np.minimum(spline(_stiffness(moduli), known)(_stiffness(fine)), _LIKELIER))
+    return np.asarray(found / found.sum())
 
 
 def _flat(x: Floats, off: Single) -> Near:
