@@ -19,9 +19,9 @@ def coarser(maps: NDArray[Any], cells: int) -> NDArray[Any]:
 def finer(maps: NDArray[Any], cells: int, *, means: bool = False) -> NDArray[Any]:
     """Maps (..., m, m) on `cells` per side, linear in between.
 
-    With ``means``, those over the squares that `coarser` takes are the maps again, and ``cells`` is a multiple
-    of m: straight lines between the means themselves would cut off peaks, and what changes across the
-    outermost squares.
+    With ``means``, those over the squares that `coarser` takes are the maps again, and ``cells`` must be a
+    multiple of m: straight lines between the means themselves would cut off peaks, and what changes across
+    the outermost squares.
     """
     step = (_exact if means else _steps)(maps.shape[-1], cells).astype(maps.dtype)
     return np.asarray(np.matmul(np.matmul(step, maps), step.T))
