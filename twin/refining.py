@@ -6,20 +6,21 @@ and the fit goes on; where it ends, the map's own error no longer matters to fir
 so far below the noise that it does not widen the posterior, nothing is rendered. What remains unknown
 lies along a narrow, bent valley: a stiffer inclusion that is a little smaller looks nearly the same. It is
 followed from modulus to modulus, all else most probable and normal around it at each (Laplace's method for
-marginals: Tierney and Kadane 1986, [tierney1986]). At each of these moduli the specimen is rendered again: a
-map's error changes along the valley by more than the noise, and would pass for knowledge of the modulus.
+marginals: Tierney and Kadane 1986, [tierney1986]). On the way out the specimen is rendered again at each of
+these moduli: a map's error changes along the valley by more than the noise, and would pass for knowledge of
+the modulus. Between them it follows from theirs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, stats
-from scipy.interpolate import CubicHermiteSpline, CubicSpline, interp1d
+from scipy.interpolate import BarycentricInterpolator, CubicHermiteSpline, CubicSpline, interp1d
 
 from estimation.features import Features
 from twin.chain import Chain
@@ -307,15 +308,17 @@ def valley(
     noise = linalg.cho_factor(louder * told + error)
     rest = np.delete(np.arange(len(fitted.x)), _HELD)
     looks = 0
+    rendered: list[Near] = []
 
     def node(x: Floats, near: Near | None) -> _Node:
+        """At a modulus, from unknowns x nearby; by rendering where it is not known how far the map is off."""
         nonlocal looks
-        if off is None:
-            x = inside(prior, x)
-            still = _flat(x, np.zeros_like(fitted.pictures))
-            return _held(chain, features, prior, observed, noise, x, rest, still)
-        if near is not None:  # as far as the map is off at its neighbour
-            x = _held(chain, features, prior, observed, noise, x, rest, near).x
+        if off is None or near is not None:
+            near = near or _flat(x, np.zeros_like(fitted.pictures))
+            return _held(chain, features, prior, observed, noise, x, rest, near)
+        if rendered:  # as far as the map is off at its neighbour
+            beside = min(rendered, key=lambda one: abs(one.at[_HELD] - x[_HELD]))
+            x = _held(chain, features, prior, observed, noise, x, rest, beside).x
         for _ in range(_LOOKS):
             x = inside(prior, x)
             near, looks = _flat(x, off(x)), looks + 1
@@ -324,6 +327,7 @@ def valley(
             x = found.x
             if moved.max() < _NEAR:
                 break
+        rendered.append(found.near)
         return found
 
     way = fitted.covariance[:, _HELD] / fitted.covariance[_HELD, _HELD]
@@ -331,10 +335,8 @@ def valley(
 
     def visit(modulus: float) -> _Node:
         """From the nearest that is known, along the valley as the fit has it."""
-        beside = found[min(found, key=lambda other: abs(other - modulus))] if found else None
-        begin = fitted.x if beside is None else beside.x
-        start = begin + way * (modulus - begin[_HELD])
-        found[modulus] = node(start, None if beside is None else beside.near)
+        begin = found[min(found, key=lambda other: abs(other - modulus))].x if found else fitted.x
+        found[modulus] = node(begin + way * (modulus - begin[_HELD]), _between(rendered, modulus))
         return found[modulus]
 
     low, high = prior.ranges[_HELD]
@@ -359,6 +361,23 @@ def valley(
         ),
         looks,
     )
+
+
+def _between(rendered: Sequence[Near], modulus: float) -> Near | None:
+    """What is known between two moduli at which specimens were rendered, along a parabola where there is a
+    third that is not beside one of them; None beyond them."""
+    moduli = np.array([one.at[_HELD] for one in rendered])
+    if len(moduli) == 0 or not moduli.min() < modulus < moduli.max():
+        return None
+    low = int(np.where(moduli <= modulus, moduli, -np.inf).argmax())
+    high = int(np.where(moduli > modulus, moduli, np.inf).argmin())
+    apart = np.minimum(np.abs(moduli - moduli[low]), np.abs(moduli - moduli[high]))
+    third = int(np.where(2.0 * apart > moduli[high] - moduli[low], np.abs(moduli - modulus), np.inf).argmin())
+    use = [low, high, third] if 2.0 * apart[third] > moduli[high] - moduli[low] else [low, high]
+    shares = BarycentricInterpolator(moduli[use], np.eye(len(use)))(modulus)
+    at = sum(share * rendered[one].at for share, one in zip(shares, use, strict=True))
+    seen = sum(np.float32(share) * rendered[one].off for share, one in zip(shares, use, strict=True))
+    return _flat(np.asarray(at), np.asarray(seen))
 
 
 def _unsure(found: Mapping[float, _Node]) -> float | None:
