@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.ticker import LogFormatter
 from numpy.typing import NDArray
+from scipy import stats
 
 from twin.assess import LEAST_MM
 from twin.report import BLUE, GREY, INK, RED, panels
@@ -116,22 +117,33 @@ def _widths(
 
 
 def _ratios(axis: Axes, answered: Mapping[int, Answered]) -> None:
+    """With the 90 % that errors of so few inclusions leave open, as if they were normal."""
     edges = np.array([LEAST_MM, 6.0, 8.0, 10.0, 13.0])
-    for (frames, one), colour in zip(answered.items(), _COLOURS, strict=False):
-        for number, (style, name) in enumerate((("-", "d"), ("--", "h"), (":", "E"))):
-            error = one.answers.mean[:, number] - one.truth[:, number]
-            found = []
-            for low, high in itertools.pairwise(edges):
-                rows = (one.truth[:, 0] >= low) & (one.truth[:, 0] < high)
-                least = np.nanmean(one.limits[rows, number] ** 2) if rows.any() else np.nan
-                found.append(np.sqrt(np.mean(error[rows] ** 2) / least) if rows.any() else np.nan)
-            middle = 0.5 * (edges[:-1] + edges[1:])
-            axis.plot(middle, found, style, color=colour, label=f"{name}, {_exposures(frames)}")
+    middle, lines = 0.5 * (edges[:-1] + edges[1:]), list(itertools.product(answered, range(3)))
+    for place, (frames, number) in enumerate(lines):
+        one, colour = answered[frames], _COLOURS[list(answered).index(frames) % len(_COLOURS)]
+        error, found = one.answers.mean[:, number] - one.truth[:, number], np.full((3, len(middle)), np.nan)
+        for column, (low, high) in enumerate(itertools.pairwise(edges)):
+            rows = (one.truth[:, 0] >= low) & (one.truth[:, 0] < high)
+            if count := int(rows.sum()):
+                ratio = np.sqrt(np.mean(error[rows] ** 2) / np.nanmean(one.limits[rows, number] ** 2))
+                ends = np.sqrt(count / stats.chi2.ppf([0.95, 0.05], count))
+                found[:, column] = ratio, *(ratio * ends)
+        aside = 0.22 * (place - 0.5 * (len(lines) - 1))
+        off = np.abs(found[1:] - found[0])
+        look = {"fmt": "osD"[number], "ms": 3.5, "color": colour, "elinewidth": 0.7}
+        axis.errorbar(middle + aside, found[0], off, label=f"{'dhE'[number]}, {_exposures(frames)}", **look)
     axis.axhline(1.0, color=GREY, lw=0.8)
+    for edge in edges[1:-1]:
+        axis.axvline(edge, color=GREY, lw=0.4, ls=":")
     axis.set(
-        xlabel="true size d / mm", ylabel="RMSE over the bound", title="how near the bound", ylim=(0, None)
+        xlabel="true size d / mm, in four classes",
+        ylabel="RMSE over the bound",
+        title="how near the bound (bars: 90 %)",
+        xlim=(edges[0], edges[-1]),
+        ylim=(0, None),
     )
-    axis.legend(frameon=False, fontsize=7, ncols=2)
+    axis.legend(frameon=False, fontsize=7, ncols=2, loc="lower center")
 
 
 def _ranks(axis: Axes, answered: Mapping[int, Answered]) -> None:
