@@ -95,7 +95,9 @@ def draw_pressure(axes: Axes, frame: Pictured, letter: str) -> None:
         vmin=float(pressure.min()),
         vmax=top,
     )
-    _colour_bar(axes, drawn, "kPa", extend="max" if pressure.max() > top else "neither")
+    beyond = pressure.max() > top
+    unit = f"kPa, at the rim up to {pressure.max():.2g}" if beyond else "kPa"
+    _colour_bar(axes, drawn, unit, extend="max" if beyond else "neither")
     width, height = camera.field_of_view_mm, camera.field_height_mm
     corner = (-width / 2, -height / 2)
     dotted: dict[str, Any] = {"fill": False, "edgecolor": "white", "lw": 0.8, "ls": (0, (1, 2))}
