@@ -259,7 +259,7 @@ def _stiffness(modulus_kPa: Floats) -> Floats:
 
 def _even(x: Floats, y: Floats) -> CubicHermiteSpline:
     """A cubic spline through nodes x (m,) of y (m, ...) whose slopes are at most twice the lesser one to a
-    node beside (after Hyman 1983, eq. 2.3; [hyman1983]). Others sway where nodes are far apart, which would
+    node beside (after Hyman 1983; [hyman1983]). Others sway where nodes are far apart, which would
     pass for a second most probable modulus."""
     chords = (np.diff(y, axis=0).T / np.diff(x)).T
     before, after = np.concatenate([chords[:1], chords]), np.concatenate([chords, chords[-1:]])
