@@ -250,7 +250,7 @@ def answer(task: Task) -> None:
         with suppress(fem.NotModelled):
             parts = ablation.bounds(estimator.chain, estimator.prior, values)
             row["parts"] = {name: sd.tolist() for name, sd in parts.items()}
-    near, start = None, None
+    begin, start = None, None
     for frames in (count for count in task.exposures if str(count) not in row):
         if frames == 1:
             seen = stored(estimator, source, task.number, levels)
@@ -274,11 +274,11 @@ def answer(task: Task) -> None:
         if task.rendered and estimator.traced:
             begins = drawn.mean(axis=0) if start is None else start
             refined = estimator.refined(
-                seen, frames, begins, samples=_DRAWS, seed=task.seed, begin=near, threads=1
+                seen, frames, begins, samples=_DRAWS, seed=task.seed, begin=begin, threads=1
             )
             if refined is not None:
                 start = refined.fitted.x[: drawn.shape[1]]
-                near = refined.near if refined.renders else None
+                begin = refined if refined.renders else None
                 found["misfit"] = refined.fitted.chi_square / len(estimator.sight.features.spread)
                 found["renders"], found["explains"] = refined.renders, refined.explains
             if refined is not None and refined.explains:

@@ -19,7 +19,7 @@ from twin import likeness
 from twin.chain import BLOCK, Chain, whole_blocks
 from twin.discrepancy import Discrepancy
 from twin.estimates import NAMES, Estimate
-from twin.fitting import Fitted, Near, Prior, fit, limits, reachable
+from twin.fitting import Fitted, Prior, fit, limits, reachable
 from twin.imagined import mean_variance
 from twin.presence import presence
 from twin.put_back import put_back, where
@@ -167,7 +167,7 @@ class Estimator:
         *,
         samples: int = 4000,
         seed: int = 0,
-        begin: Near | None = None,
+        begin: Refined | None = None,
         threads: int | None = None,
         prior: Prior | None = None,
         blocks: NDArray[np.bool_] | None = None,

@@ -79,6 +79,7 @@ class Refined:
     explains : whether noise explains the rest, up to `_LOUDEST` times the variance that is known of: a camera
         may be noisier than told. If not, these pictures are not what is rendered.
     renders : how many specimens were rendered.
+    off : by how much rendered pictures are above the chain's at unknowns (5 + q,); None where none was.
     """
 
     samples: Floats
@@ -86,6 +87,7 @@ class Refined:
     near: Near
     explains: bool
     renders: int
+    off: Callable[[Floats], Single] | None
 
 
 def refine(
@@ -101,7 +103,7 @@ def refine(
     quick: Callable[[Mapping[str, float]], Single] | None = None,
     samples: int = 4000,
     seed: int = 0,
-    begin: Near | None = None,
+    begin: Refined | None = None,
     always: Floats | float = 0.0,
 ) -> Refined:
     """Return the posterior for features (k,) of pictures that are means of so many exposures.
@@ -113,11 +115,11 @@ def refine(
     render : expected pictures (levels, 2, r, c) of a specimen's values, by light transport.
     quick : the same of pictures without their references, (levels, 1, r, c), of which only the change between
         specimens that are alike is right.
-    begin : what is known of the light map's errors around the specimen, from other pictures of it: the
-        fit begins there, for far from it that says nothing.
+    begin : what other pictures of the same specimen told, with rendering: the fit begins there, with what is
+        known of the light map's errors around it.
     always : (k, k) covariance of what rendered pictures are off by.
     """
-    near = begin
+    near = None if begin is None else begin.near
     remains = _REMAINS**2 * error + always
     first = error + always if near is None else remains
     begins = start if near is None else near.at
@@ -127,8 +129,9 @@ def refine(
         if float((found.covariance.diagonal() / exact.diagonal())[:5].max()) < _AS_WELL**2:
             followed, _ = valley(chain, features, prior, observed, frames, found, first)
             still = _flat(found.x, np.zeros_like(found.pictures))
-            return Refined(followed.draw(prior, samples, seed), found, still, True, 0)
-    off = _off(chain, prior, found.x, render, quick)
+            return Refined(followed.draw(prior, samples, seed), found, still, True, 0, None)
+    known = None if begin is None else begin.off
+    off = known or _off(chain, prior, found.x, render, quick)
     remains = _REMAINS**2 * _as_here(features, error, found.pictures, off(found.x)) * error + always
     for renders in range(1, _RENDERS + 1):  # noqa: B007
         at = found.x
@@ -143,7 +146,8 @@ def refine(
 
     remains = remains + (louder - 1.0) * always  # told by few pictures, it may be too small itself
     followed, more = valley(chain, features, prior, observed, frames, found, remains, off, louder)
-    return Refined(followed.draw(prior, samples, seed), found, near, bool(louder < _LOUDEST), renders + more)
+    drawn, explains = followed.draw(prior, samples, seed), bool(louder < _LOUDEST)
+    return Refined(drawn, found, near, explains, renders + more, off)
 
 
 def _off(
@@ -155,23 +159,31 @@ def _off(
 ) -> Callable[[Floats], Single]:
     """By how much rendered pictures are above the chain's at unknowns (5 + q,).
 
-    Quickly, from what is rendered ``at`` a specimen, as long as the references are about as they are there:
+    Quickly, from what was rendered ``at`` a specimen, as long as the references are about as they are there:
     along the valley only the inclusion changes, which they do not show. What else changes a little is left
     as it was: it moves picture and reference alike, and their difference would pass for an inclusion's.
     """
-    values, plain = prior.values(at), expected(chain, prior, [at])[0]
     aside = any(name in prior.names for name in ALIGNMENT)
-    first = placed(render(values)[None], [values])[0] - plain
     begins: list[Single] = []
 
+    def whole(x: Floats) -> tuple[Floats, Single, Single]:
+        """What is rendered at a specimen, from which others are told quickly."""
+        values, plain = prior.values(x), expected(chain, prior, [x])[0]
+        begins.clear()
+        return x, plain, np.asarray(placed(render(values)[None], [values])[0] - plain, np.float32)
+
+    at, plain, first = whole(at)
+
     def off(x: Floats) -> Single:
+        nonlocal at, plain, first
         if np.array_equal(x, at):
-            return np.asarray(first, np.float32)
-        new, seen = prior.values(x), expected(chain, prior, [x])[0]
+            return first
+        seen = expected(chain, prior, [x])[0]
         if quick is None or aside or np.sqrt(np.mean((seen - plain)[:, 1] ** 2)) > _ALIKE:
-            return np.asarray(placed(render(new)[None], [new])[0] - seen, np.float32)
+            at, plain, first = whole(x)
+            return first
         if not begins:
-            begins.append((first + plain)[:, :1] - quick(values))
+            begins.append((first + plain)[:, :1] - quick(prior.values(at)))
         alone = np.concatenate([x[: len(PARAMETERS)], at[len(PARAMETERS) :]])
         pressed = begins[0] + quick(prior.values(alone)) - expected(chain, prior, [alone])[0][:, :1]
         return np.concatenate([pressed, first[:, 1:]], axis=1)
