@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import linalg, optimize
 
-from twin import fitting, refining
+from twin import fitting, refining, valley
 from twin.fitting import Prior
 from twin.study import PARAMETERS
 
@@ -52,7 +52,7 @@ def simple(monkeypatch: pytest.MonkeyPatch) -> None:
     def covariance(chain: Any, features: Any, seen: Any, gain: Any, frames: float, pattern: Any) -> Any:
         return np.eye(K) * NOISE**2 / frames
 
-    for module in (fitting, refining):
+    for module in (fitting, refining, valley):
         monkeypatch.setattr(module, "covariance", covariance)
     for module in (fitting, refining):
         monkeypatch.setattr(module, "expected", expected)
@@ -177,7 +177,7 @@ def test_quick_pictures_tell_the_same_valley(monkeypatch: pytest.MonkeyPatch) ->
     start = x + np.array([0.4, -0.3, -5.0, 0.0, 0.0, 0.0])
     parts = (CHAIN, features, PRIOR, np.eye(K) * 0.15**2, told, 1.0, start)
     monkeypatch.setattr(refining, "_ALIKE", 1.0)
-    monkeypatch.setattr(refining, "_UNSURE", np.inf)  # the same moduli in both
+    monkeypatch.setattr(valley, "_UNSURE", np.inf)  # the same moduli in both
     one = refining.refine(*parts, whole, seed=5)
     looks.clear()
     other = refining.refine(*parts, whole, quick=quick, seed=5)
@@ -283,8 +283,8 @@ def test_all_else_is_most_probable_with_the_modulus_held_and_the_depth_at_its_en
     best = optimize.minimize(
         cost, start[rest], method="L-BFGS-B", bounds=[*RANGES[[0, 1, 3, 4]], (-4, 4)], options={"ftol": 1e-14}
     )
-    near = refining._flat(start, np.zeros(Features.shape, np.float32))
-    found = refining._held(CHAIN, features, PRIOR, observed, noise, start, rest, near)  # type: ignore[arg-type]
+    near = valley.flat(start, np.zeros(Features.shape, np.float32))
+    found = valley._held(CHAIN, features, PRIOR, observed, noise, start, rest, near)  # type: ignore[arg-type]
     assert found.x[1] == 12.0
     assert cost(found.x[rest]) < best.fun + 0.1
 
@@ -328,7 +328,7 @@ def test_a_turned_prior_is_the_same_and_leaves_the_contact_alone() -> None:
 def test_between_moduli_the_density_is_not_beyond_theirs(nodes):
     moduli, logs = np.array(nodes).T
     points = np.insert(np.tile([9.0, 5.5, 1.0, -0.5, 0.0], (len(moduli), 1)), 2, moduli, axis=1)
-    found = refining.Valley(moduli, logs, points, np.tile(1e-4 * np.eye(4), (len(moduli), 1, 1)))
+    found = valley.Valley(moduli, logs, points, np.tile(1e-4 * np.eye(4), (len(moduli), 1, 1)))
     drawn = found.draw(PRIOR, 40000, 0)[:, 2]
     density, edges = np.histogram(drawn, 40, (moduli[0], moduli[-1]), density=True)
     log = np.log(np.maximum(density, 1e-12))
