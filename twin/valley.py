@@ -2,8 +2,8 @@
 
 It is followed from modulus to modulus, all else most probable and normal around it at each (Laplace's method
 for marginals: Tierney and Kadane 1986, [tierney1986]). On the way out the specimen is rendered again at each
-of these moduli: a map's error changes along the valley by more than the noise, and would pass for knowledge of
-the modulus. Between them it follows from theirs.
+of these moduli: a map's error changes along the valley by more than the noise, and would pass for knowledge
+of the modulus. Between them it follows from theirs.
 """
 
 from __future__ import annotations
