@@ -120,6 +120,7 @@ def _ratios(axis: Axes, answered: Mapping[int, Answered]) -> None:
     """With the 90 % that errors of so few inclusions leave open, as if they were normal."""
     edges = np.array([LEAST_MM, 6.0, 8.0, 10.0, 13.0])
     middle, lines = 0.5 * (edges[:-1] + edges[1:]), list(itertools.product(answered, range(3)))
+    most = 1.5  # that is drawn: bars of one inclusion alone go far beyond
     for place, (frames, number) in enumerate(lines):
         one, colour = answered[frames], _COLOURS[list(answered).index(frames) % len(_COLOURS)]
         error, found = one.answers.mean[:, number] - one.truth[:, number], np.full((3, len(middle)), np.nan)
@@ -129,6 +130,7 @@ def _ratios(axis: Axes, answered: Mapping[int, Answered]) -> None:
                 ratio = np.sqrt(np.mean(error[rows] ** 2) / np.nanmean(one.limits[rows, number] ** 2))
                 ends = np.sqrt(count / stats.chi2.ppf([0.95, 0.05], count))
                 found[:, column] = ratio, *(ratio * ends)
+        most = max(most, 1.5 * float(np.nanmax(found[0], initial=0.0)))
         aside = 0.22 * (place - 0.5 * (len(lines) - 1))
         off = np.abs(found[1:] - found[0])
         look = {"fmt": "osD"[number], "ms": 3.5, "color": colour, "elinewidth": 0.7}
@@ -141,7 +143,7 @@ def _ratios(axis: Axes, answered: Mapping[int, Answered]) -> None:
         ylabel="RMSE over the bound",
         title="how near the bound (bars: 90 %)",
         xlim=(edges[0], edges[-1]),
-        ylim=(0, None),
+        ylim=(0, most),
     )
     axis.legend(frameon=False, fontsize=7, ncols=2, loc="lower center")
 
