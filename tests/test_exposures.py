@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from scenes.camera import expose
+from scenes.camera import expose, fixed_pattern
 from twin import retake
+from twin.block_noise import mean_variance, rounding
 from twin.chain import BLOCK
 from twin.design import Design, load_design
 from twin.exposure import _received
-from twin.imagined import mean_variance
+
+Floats = NDArray[np.float64]
 
 
 def small() -> Design:
@@ -19,7 +21,7 @@ def small() -> Design:
     return replace(design, camera=replace(design.camera, columns=192, rows=120))
 
 
-def radiance(design: Design, top: float) -> NDArray[np.float64]:
+def radiance(design: Design, top: float) -> Floats:
     """A smooth ramp of light from one LED up to so many counts."""
     rows, columns = design.camera.shape
     ramp = np.linspace(0.1, 1.0, columns) * np.linspace(0.6, 1.0, rows)[:, None]
@@ -40,30 +42,49 @@ def test_mean_of_is_the_mean_of_exposures(top: float) -> None:
     assert abs(np.mean(real - limit)) < 4.0 * np.std(real - limit) / np.sqrt(real.size)
 
 
+def blocks(design: Design, top: float, frames: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    """What blocks of a picture and its reference are above the light, and the light, counts (1, 2, r, c)."""
+    camera, light = design.camera, radiance(design, top)
+    _, offset = fixed_pattern(camera)
+    dark = offset + camera.dark_current_e_s * camera.exposure_ms * 1e-3
+    charge = retake.charges(design, light, (1, 1)).sum(axis=0)
+    truth = (charge + dark) / camera.gain_e_per_dn + camera.offset_dn
+    pair = [retake.mean_of(design, light, count, rng) for count in (frames, max(frames, 16))]
+    off = [retake.average(np.float32(one - truth), BLOCK) for one in pair]
+    counts = retake.average(charge / np.float32(camera.gain_e_per_dn), BLOCK)
+    return np.stack(off)[None], np.stack([counts, counts])[None]
+
+
+def free_of_pattern(design: Design) -> Design:
+    return replace(design, camera=replace(design.camera, prnu_percent=0.0, dsnu_e=0.0))
+
+
 @pytest.mark.parametrize("frames", [1, 16, 100])
 @pytest.mark.parametrize("top", [8.0, 150.0])
 def test_noise_of_blocks_is_the_cameras(top: float, frames: int) -> None:
-    """Variance of block means about the light, with what rounding leaves however many are averaged."""
+    """Variance of block means about the light, with what rounding leaves however many are averaged; and about
+    the light as it is rounded."""
     design, rng = small(), np.random.default_rng(1)
-    camera, errors, expected = design.camera, [], []
-    response_free = replace(design, camera=replace(camera, prnu_percent=0.0, dsnu_e=0.0))
+    gain = np.array([design.camera.gain_e_per_dn])
+    errors, expected = [], []
     for scale in np.linspace(0.9, 1.1, 8):  # other phases of the rounding
-        light = radiance(design, top * scale)
-        pair = np.stack([light, light])
-        seen = [
-            retake.mean_of(response_free, one, frames if n == 0 else max(frames, 16), rng)
-            for n, one in enumerate(pair)
-        ]
-        plain = retake.charges(response_free, light, (1, 1)).sum(axis=0)
-        dark = camera.dark_current_e_s * camera.exposure_ms * 1e-3
-        truth = (plain + dark) / camera.gain_e_per_dn + camera.offset_dn
-        coarse = np.stack([retake.average(np.float32(one - truth), BLOCK) for one in seen])
-        counts = retake.average(np.float32(truth - camera.offset_dn), BLOCK)
-        told = mean_variance(
-            response_free, np.stack([counts, counts])[None], np.array([camera.gain_e_per_dn]), frames
-        )[0]
-        errors.append(coarse**2)
-        expected.append(told)
-    found, told = np.mean(errors, axis=(0, 2, 3)), np.mean(expected, axis=(0, 2, 3))
+        off, counts = blocks(design, top * scale, frames, rng)
+        rounded = off - rounding(design, counts, gain)
+        errors.append(np.stack([off, rounded]) ** 2)
+        expected.append(
+            [mean_variance(design, counts, gain, frames, rounded=known) for known in (False, True)]
+        )
+    found, told = np.mean(errors, axis=(0, 2, 4, 5)), np.mean(expected, axis=(0, 2, 4, 5))
     # four standard errors of 1280 blocks
     assert np.all(np.abs(np.sqrt(found / told) - 1.0) < 4.0 / np.sqrt(2.0 * 1280)), (found, told)
+
+
+def test_rounding_is_known() -> None:
+    """Of what the mean of endless exposures is off by where light is dim, all is known but for the camera's
+    pattern: a picture and its reference are off by the same, which two noises are not."""
+    rng = np.random.default_rng(2)
+    for design, left in ((free_of_pattern(small()), 0.02), (small(), 0.1)):
+        off, counts = blocks(design, 8.0, 10**9, rng)
+        known = rounding(design, counts, np.array([design.camera.gain_e_per_dn]))
+        assert np.allclose(off[0, 0], off[0, 1], atol=1e-5)
+        assert np.std(off - known) < left * np.std(off)

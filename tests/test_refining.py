@@ -49,7 +49,9 @@ def simple(monkeypatch: pytest.MonkeyPatch) -> None:
         seen = light_map(np.array(many)).reshape(-1, *Features.shape)
         return seen if near is None else seen + near.of(many)
 
-    def covariance(chain: Any, features: Any, seen: Any, gain: Any, frames: float, pattern: Any) -> Any:
+    def covariance(
+        chain: Any, features: Any, seen: Any, gain: Any, frames: float, pattern: Any, rounded: bool = False
+    ) -> Any:
         return np.eye(K) * NOISE**2 / frames
 
     for module in (fitting, refining, valley):

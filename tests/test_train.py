@@ -11,12 +11,13 @@ from scipy.ndimage import gaussian_filter
 
 import twin
 from twin import index, sample, store
+from twin.block_noise import mean_variance
 from twin.calibrate import _drawn, calibrate, calibrated, check_paths
 from twin.complaint import DesignError
 from twin.discrepancy import Discrepancy
 from twin.estimator import Estimator, Sight, black
 from twin.estimator_file import emulator_of, load_estimator, save_estimator
-from twin.imagined import Brightness, mean_variance, pictures
+from twin.imagined import Brightness, pictures
 from twin.likeness import likeness
 from twin.plan import load_plan
 from twin.received import Received

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
+from twin.block_noise import mean_variance
 from twin.chain import BLOCK, Chain
 from twin.estimates import NAMES
 from twin.fitting import Prior, differences, expected_layers
-from twin.imagined import mean_variance
 
 Floats = NDArray[np.float64]
 
@@ -36,7 +36,7 @@ def bounds(chain: Chain, prior: Prior, values: Mapping[str, float]) -> dict[str,
     levels, n_led = len(seen), seen.shape[2]
 
     def variance(frames: float, of: Floats = whole) -> Floats:
-        return mean_variance(chain.design, of[None], gain, frames)[0].astype(np.float64)
+        return mean_variance(chain.design, of[None], gain, frames, rounded=True)[0].astype(np.float64)
 
     def told(slope: Floats, noise: Floats) -> Floats:
         part = (slope / np.sqrt(noise)).reshape(len(slope), -1)

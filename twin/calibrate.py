@@ -21,6 +21,7 @@ from scipy.ndimage import gaussian_filter
 from estimation.features import compress
 from twin import retake
 from twin.assessing import Sample, levels_of, loaded, one_thread, opened, values_of
+from twin.block_noise import mean_variance
 from twin.chain import BLOCK, whole_blocks
 from twin.complaint import DesignError, shown
 from twin.corpus import Corpus
@@ -29,7 +30,7 @@ from twin.estimator import Estimator, Sight
 from twin.estimator_file import emulator_of, file_of, load_estimator, save_estimator, shares_of
 from twin.fitting import inside, reachable
 from twin.frame import versions
-from twin.imagined import Brightness, mean_variance, pictures
+from twin.imagined import Brightness, pictures
 from twin.planned import Plan
 from twin.pooled import each
 from twin.rendered import rendered

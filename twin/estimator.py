@@ -16,11 +16,11 @@ from estimation.posterior import MOST_FRAMES, REFERENCE_FRAMES, Posterior
 from scenes.sensor import NotModelled
 from scenes.traced import TracedLight
 from twin import likeness
+from twin.block_noise import mean_variance, rounding
 from twin.chain import BLOCK, Chain, whole_blocks
 from twin.discrepancy import Discrepancy
 from twin.estimates import NAMES, Estimate
 from twin.fitting import Fitted, Prior, fit, limits, reachable
-from twin.imagined import mean_variance
 from twin.presence import presence
 from twin.put_back import put_back, where
 from twin.received import Received
@@ -119,7 +119,8 @@ class Estimator:
             method, answer = "unrendered", self.normal(fitted, samples, seed)
         wanted, seen = answer[:, : len(NAMES)], self.sight.without(seen)
         gain = np.array([self.chain.gain(self.prior.values(fitted.x[: len(self.prior.middle)]))])
-        variance = mean_variance(self.chain.design, seen[None], gain, frames)[0]
+        rounded = method == "rendered"
+        variance = mean_variance(self.chain.design, seen[None], gain, frames, rounded=rounded)[0]
         return Estimate(
             NAMES,
             wanted,
@@ -179,7 +180,8 @@ class Estimator:
 
         def pictures(values: Mapping[str, float], quick: bool = False) -> Single:
             values = reachable(self.chain, dict(values))
-            return render(self.chain, self.traced, values, threads=threads, quick=quick)
+            seen = render(self.chain, self.traced, values, threads=threads, quick=quick)
+            return seen + rounding(self.chain.design, seen, np.array(self.chain.gain(values)))
 
         try:
             return refine(

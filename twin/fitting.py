@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from estimation.alignment import moved
 from estimation.features import Features
 from fem.sampling import clearance
+from twin.block_noise import mean_variance
 from twin.chain import BLOCK, Chain
-from twin.imagined import Brightness, mean_variance, pictures
+from twin.imagined import Brightness, pictures
 from twin.likeness import MISALIGNED_PERCENT
 from twin.study import PARAMETERS
 
@@ -249,13 +250,14 @@ def covariance(
     gain: float,
     frames: float,
     pattern: float = 0.0,
+    rounded: bool = False,
 ) -> Floats:
     """Return the covariance (k, k) of the features' noise in pictures (levels, 2, r, c) of so many exposures.
 
     References are the mean of `imagined.REFERENCE_FRAMES` at least. ``pattern`` is that of `Prior`; it is
-    the same in all pictures.
+    the same in all pictures. ``rounded`` tells that expected pictures have what rounding does to blocks.
     """
-    variance = mean_variance(chain.design, seen[None], np.array([gain]), frames)[0]
+    variance = mean_variance(chain.design, seen[None], np.array([gain]), frames, rounded=rounded)[0]
     total = np.zeros((len(features.spread),) * 2)
     onto = features.onto
     for place in (0, 1):
@@ -294,7 +296,7 @@ def fit(
     for _ in range(_MOST):
         seen, slopes = jacobian(chain, features, prior, x, near)
         gain = chain.gain(prior.values(x))
-        noise = covariance(chain, features, seen, gain, frames, prior.pattern)
+        noise = covariance(chain, features, seen, gain, frames, prior.pattern, rounded=near is not None)
         noise += 0.0 if error is None else error
         weighted = np.linalg.solve(noise, slopes.T)
         rest = observed - features(seen[None])[0]
@@ -388,7 +390,8 @@ def limits(
     """
     x = prior.unknowns(values)
     seen, slopes = jacobian(chain, features, prior, x)
-    noise = covariance(chain, features, seen, chain.gain(prior.values(x)), frames) + off(seen)
+    gain = chain.gain(prior.values(x))
+    noise = covariance(chain, features, seen, gain, frames, rounded=True) + off(seen)
     told = slopes @ np.linalg.solve(noise, slopes.T)
     without = np.stack([seen[:, 1], seen[:, 1]], axis=1)
     signal = (features(seen[None])[0] - features(without[None])[0]).astype(np.float64)

@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 import fem
 from estimation.features import Features
 from estimation.novelty import misaligned
-from estimation.posterior import REFERENCE_FRAMES, Simulated
-from twin.chain import BLOCK, FIELDS, Chain, contacts
+from estimation.posterior import Simulated
+from twin.block_noise import noise_variance
+from twin.chain import FIELDS, Chain, contacts
 from twin.complaint import DesignError, shown
 from twin.design import Design
 from twin.fields import expand, tables_of
 from twin.plan import Plan
 from twin.pooled import ENDED
-from twin.retake import squares
 from twin.settling import Setting, drawn
 from twin.study import PARAMETERS, parse_study
 
@@ -140,45 +140,6 @@ def misaligned_share(seen: Single, rng: np.random.Generator) -> Single:
     flat = off.reshape(len(off), -1, *off.shape[-2:])
     found[1::2] = misaligned(flat, rng, MISALIGNED_PERCENT).reshape(off.shape)
     return found
-
-
-def noise_variance(
-    design: Design, counts: NDArray[np.floating], gain: NDArray[np.floating]
-) -> tuple[Single, Single]:
-    """Return what a block of pixels is off by, counts², for counts above black: the variance of one exposure,
-    and what no further exposure averages out.
-
-    The first is of photons, dark charge, reading (EMVA 1288 release 4.0 linear, section 2; [emva1288]) and
-    rounding. The second is what rounding does every time alike, because the rest of the noise is too small to
-    blur the counts' steps: waves sin(2πkµ) exp(-2π²k²s²)/(πk) of a pixel's mean µ and noise s (Widrow and
-    Kollár 2008, chapter 4; [widrow2008]). Pixels of one block share their phase, but for what spreads their
-    means: the camera's pattern and the picture's slope.
-    """
-    camera, pixels = design.camera, BLOCK[0] * BLOCK[1]
-    dark_e = camera.dark_current_e_s * camera.exposure_ms * 1e-3 * camera.binning**2
-    gain = np.asarray(gain, np.float32).reshape(-1, *(1,) * (counts.ndim - 1))
-    light = np.maximum(counts, 0.0)
-    noise = (light * gain + camera.read_noise_e**2 + dark_e) / gain**2
-    slopes = np.gradient(counts, axis=(-2, -1))
-    spread = (camera.dsnu_e / gain) ** 2 + (0.01 * camera.prnu_percent * light) ** 2
-    spread = spread + (slopes[0] ** 2 + slopes[1] ** 2) / 12.0
-    blur, shared = (np.exp(-4.0 * np.pi**2 * one, dtype=np.float32) for one in (noise, spread))
-    stays, random = np.zeros_like(blur), (noise + 1.0 / 12.0) / pixels
-    for k, (wave, together) in enumerate(zip(squares(blur), squares(shared), strict=True), start=1):
-        wave /= np.float32(2.0 * np.pi**2 * k * k)
-        stays += wave * (together + (1.0 - together) / pixels)
-        random -= wave / pixels
-    return np.asarray(random, np.float32), np.asarray(stays, np.float32)
-
-
-def mean_variance(
-    design: Design, counts: NDArray[np.floating], gain: NDArray[np.floating], frames: float
-) -> Single:
-    """Return the same of means, for counts (..., 2, r, c) of pictures and references: pictures are the mean
-    of so many exposures, references of as many, but `REFERENCE_FRAMES` at least."""
-    random, stays = noise_variance(design, counts, gain)
-    count = np.array([frames, max(frames, REFERENCE_FRAMES)], np.float32).reshape(2, 1, 1)
-    return random / count + stays
 
 
 def simulate(

@@ -81,7 +81,8 @@ def refine(
     ----------
     error : (k, k) covariance of the light map's errors in features.
     start : (5 + q,) where the fit begins.
-    render : expected pictures (levels, 2, r, c) of a specimen's values, by light transport.
+    render : expected pictures (levels, 2, r, c) of a specimen's values, by light transport, with what
+        rounding does to blocks (`twin.block_noise.rounding`).
     quick : the same of pictures without their references, (levels, 1, r, c), of which only the change between
         specimens that are alike is right.
     begin : what other pictures of the same specimen told, with rendering: the fit begins there, with what is

@@ -29,6 +29,7 @@ from estimation.posterior import MOST_FRAMES, Simulated, Training, device_of, re
 from estimation.posterior import train as train_network
 from scenes import traced
 from twin import assess, likeness
+from twin.block_noise import mean_variance
 from twin.chain import BLOCK, Chain, coarse_charges, contacts
 from twin.complaint import DesignError, shown
 from twin.corpus import Corpus
@@ -42,7 +43,6 @@ from twin.imagined import (
     WANTED,
     Brightness,
     inputs_of,
-    mean_variance,
     misaligned_share,
     pictures,
     simulate,

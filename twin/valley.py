@@ -126,7 +126,8 @@ def valley(
     The valley, and how many specimens were rendered.
     """
     gain = chain.gain(prior.values(fitted.x))
-    told = covariance(chain, features, fitted.pictures, gain, frames, prior.pattern)
+    rounded = off is not None
+    told = covariance(chain, features, fitted.pictures, gain, frames, prior.pattern, rounded=rounded)
     noise = linalg.cho_factor(louder * told + error)
     rest = np.delete(np.arange(len(fitted.x)), _HELD)
     looks = 0
