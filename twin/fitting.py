@@ -1,8 +1,8 @@
 """The model-based estimator: the most probable specimen by the chain, and the bound from the same chain.
 
 Pictures are features (`estimation.features`) with normal noise; what is not known has a normal prior, the
-inclusion's that of a uniform draw from its ranges. Gauss-Newton steps, shortened or damped, lead to the most
-probable values (Kay 1993, section 11.5; [kay1993]); derivatives are central differences of the chain.
+inclusion's that of a uniform draw from its ranges. Gauss-Newton steps, bent along the valley (`twin.bent`),
+lead to the most probable values (Kay 1993, section 11.5; [kay1993]); derivatives are central differences.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from estimation.alignment import moved
 from estimation.features import Features
 from fem.sampling import clearance
+from twin.bent import bent
 from twin.block_noise import mean_variance
 from twin.chain import BLOCK, Chain
 from twin.imagined import Brightness, pictures
@@ -31,9 +32,6 @@ _NUISANCE_STEP = 0.1  # standard deviations
 _MOST = 12  # Gauss-Newton steps
 _DONE = 0.01  # step in standard deviations that ends them
 _SHARES = (1.0, 0.5, 0.2, 0.05)  # of a step that are tried
-_DAMPED = (1e2, 1e3, 1e4, 1e5)
-"""Times the prior's precision that are added to the information for others (Levenberg 1944; [levenberg1944]):
-where means of 100 exposures leave a valley that is thin and bent, no share of the plain step stays in it."""
 _NOTHING = 1e-9  # of a number's spread: rounding
 _AT_END = 1e-9  # of a range: no nearer to its end is told from being there
 
@@ -291,7 +289,7 @@ def fit(
     near : what is known of these errors around the start.
     held : how many of the unknowns, from the first on, stay at the start.
     """
-    x, precision = inside(prior, start), prior.precision
+    x, precision, tissue_kPa = inside(prior, start), prior.precision, chain.design.specimen.modulus_kPa
     found: Fitted | None = None
     for _ in range(_MOST):
         seen, slopes = jacobian(chain, features, prior, x, near)
@@ -308,11 +306,13 @@ def fit(
         inverse = 0.5 * (inverse + inverse.T)  # even but for rounding, which who draws from it would see
         found = Fitted(x, inverse, float(rest @ np.linalg.solve(noise, rest)), seen)
         size = np.abs(step) / np.sqrt(np.diag(inverse))
-        steps = [share * step for share in _SHARES]
-        steps += [step_inside(prior, x, information + more * precision, slope, free)[0] for more in _DAMPED]
-        x = _stepped(chain, features, prior, x, steps, observed, noise, near)
         if size.max() < _DONE and not cut:
             break
+        tried = [inside(prior, bent(x, share * step, prior.ranges[2], tissue_kPa)) for share in _SHARES]
+        best = _likeliest(chain, features, prior, [x, *tried], observed, noise, near)
+        if best == 0:
+            break
+        x = tried[best - 1]
     assert found is not None
     return found
 
@@ -345,23 +345,21 @@ def step_inside(
     return np.asarray(step * share), share < 1.0
 
 
-def _stepped(
+def _likeliest(
     chain: Chain,
     features: Features,
     prior: Prior,
-    x: Floats,
-    steps: Sequence[Floats],
+    tried: Sequence[Floats],
     observed: NDArray[np.floating],
     noise: Floats,
     near: Near | None,
-) -> Floats:
-    """Go the step that lowers the sum of squares most, or stay."""
-    tried = [x, *(inside(prior, x + step) for step in steps)]
+) -> int:
+    """Return which of unknowns (5 + q,) has the least sum of squares."""
     rest = observed - features(expected(chain, prior, tried, near))
     away = np.stack(tried) - prior.middle
     cost = np.einsum("nk,nk->n", rest, np.linalg.solve(noise, rest.T).T)
     cost += np.einsum("ni,ij,nj->n", away, prior.precision, away)
-    return tried[int(np.argmin(cost))]
+    return int(np.argmin(cost))
 
 
 def inside(prior: Prior, x: Floats) -> Floats:

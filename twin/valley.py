@@ -18,6 +18,7 @@ from scipy import linalg
 from scipy.interpolate import BarycentricInterpolator, CubicHermiteSpline, CubicSpline, interp1d
 
 from estimation.features import Features
+from twin.bent import onto
 from twin.chain import Chain
 from twin.fitting import Fitted, Near, Prior, covariance, inside, jacobian, step_inside
 
@@ -153,13 +154,15 @@ def valley(
         rendered.append(found.near)
         return found
 
+    tissue_kPa = chain.design.specimen.modulus_kPa
     way = fitted.covariance[:, _HELD] / fitted.covariance[_HELD, _HELD]
     found: dict[float, _Node] = {}
 
     def visit(modulus: float) -> _Node:
         """From the nearest that is known, along the valley as the fit has it."""
         begin = found[min(found, key=lambda other: abs(other - modulus))].x if found else fitted.x
-        found[modulus] = node(begin + way * (modulus - begin[_HELD]), _between(rendered, modulus))
+        there = onto(begin, way, modulus, prior.ranges[_HELD], tissue_kPa)
+        found[modulus] = node(there, _between(rendered, modulus))
         return found[modulus]
 
     low, high = prior.ranges[_HELD]
