@@ -5,6 +5,7 @@ TWIN_MODEL=models/tsis TWIN_CORPUS=corpora/pictures pytest -m slow -s tests/benc
 
 import os
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,11 +15,16 @@ from other_camera import real_camera
 
 import twin
 from twin import likeness
+from twin.assess import averaged, stored
+from twin.assessing import levels_of, values_of
+from twin.block_noise import rounding
 from twin.complaint import DesignError
 from twin.estimates import NAMES
 from twin.estimator import Estimator, black
 from twin.estimator_file import load_estimator
+from twin.fitting import covariance
 from twin.received import Received
+from twin.rendered import rendered
 from twin.sound import check_exposure, check_pair
 from twin.train import TEST
 
@@ -91,6 +97,38 @@ def test_valid_pictures_are_taken_and_others_refused(estimator: Estimator, corpu
     )
     assert sum(valid) <= 0.02 * len(valid) and sum(moved) <= 0.02 * len(moved)
     assert found.total() >= 0.95 * len(strange)
+
+
+@pytest.mark.timeout(3600)
+def test_noise_alone_explains_what_is_not_rendered_at_the_truth(
+    estimator: Estimator, corpus: twin.Corpus
+) -> None:
+    """Chi-square per feature of a corpus of the model's own chain, of one exposure and means of 100, with
+    what rounding does to dim blocks taken as known and as noise; five seconds a sample."""
+    own = replace(estimator, calibration=None)
+    chain, features, levels = own.chain, own.sight.features, levels_of(corpus, own)
+    found: dict[tuple[int, bool], list[float]] = {}
+    numbers = [number for number in held_out(corpus) if truth(corpus, number) is not None][: 2 * ANSWERED]
+    for number in numbers:
+        values = values_of(corpus, own, number, levels)
+        light, gain = rendered(chain, own.traced, values), chain.gain(values)
+        for frames in (1, 100):
+            seen = stored(own, corpus, number, levels) if frames == 1 else None
+            seen = averaged(own, corpus, number, levels, frames, 0) if seen is None else seen
+            for known in (False, True):
+                told = light + known * rounding(chain.design, light, np.array(gain))
+                noise = covariance(chain, features, light, gain, frames, rounded=known)
+                left = (features(seen[None]) - features(told[None]))[0].astype(np.float64)
+                share = left @ np.linalg.solve(noise, left) / len(left)
+                found.setdefault((frames, known), []).append(float(share))
+    spread = np.sqrt(2.0 / (len(numbers) * len(features.spread)))
+    for (frames, known), shares in found.items():
+        print(
+            f"{frames} exposures, rounding {'known' if known else 'as noise'}: {np.mean(shares):.3f} of "
+            f"{len(shares)}, by chance 1 +- {spread:.3f}; the worst {max(shares):.2f}"
+        )
+    for frames in (1, 100):
+        assert abs(np.mean(found[frames, True]) - 1.0) < 4.0 * spread
 
 
 @pytest.mark.timeout(3600)
