@@ -1,8 +1,9 @@
 """The model-based estimator: the most probable specimen by the chain, and the bound from the same chain.
 
 Pictures are features (`estimation.features`) with normal noise; what is not known has a normal prior, the
-inclusion's that of a uniform draw from its ranges. Gauss-Newton steps, bent along the valley (`twin.bent`),
-lead to the most probable values (Kay 1993, section 11.5; [kay1993]); derivatives are central differences.
+inclusion's that of a uniform draw from its ranges. Gauss-Newton steps, bent along the valley
+(`twin.valley_steps`), lead to the most probable values (Kay 1993, section 11.5; [kay1993]); derivatives are
+central differences.
 """
 
 from __future__ import annotations
@@ -16,12 +17,12 @@ from numpy.typing import NDArray
 from estimation.alignment import moved
 from estimation.features import Features
 from fem.sampling import clearance
-from twin.bent import bent
 from twin.block_noise import mean_variance
 from twin.chain import BLOCK, Chain
 from twin.imagined import Brightness, pictures
 from twin.likeness import MISALIGNED_PERCENT
 from twin.study import PARAMETERS
+from twin.valley_steps import bent
 
 Floats = NDArray[np.float64]
 

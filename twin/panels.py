@@ -96,7 +96,7 @@ def draw_pressure(axes: Axes, frame: Pictured, letter: str) -> None:
         vmax=top,
     )
     beyond = pressure.max() > top
-    unit = f"kPa, at the rim up to {pressure.max():.2g}" if beyond else "kPa"
+    unit = f"kPa (singular rim: {pressure.max():.2g} on this mesh)" if beyond else "kPa"
     _colour_bar(axes, drawn, unit, extend="max" if beyond else "neither")
     width, height = camera.field_of_view_mm, camera.field_height_mm
     corner = (-width / 2, -height / 2)

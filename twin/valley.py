@@ -18,9 +18,9 @@ from scipy import linalg
 from scipy.interpolate import BarycentricInterpolator, CubicHermiteSpline, CubicSpline, interp1d
 
 from estimation.features import Features
-from twin.bent import onto
 from twin.chain import Chain
 from twin.fitting import Fitted, Near, Prior, covariance, inside, jacobian, step_inside
+from twin.valley_steps import onto
 
 Floats = NDArray[np.float64]
 Single = NDArray[np.float32]
