@@ -195,7 +195,8 @@ def test_quick_pictures_tell_the_same_valley(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_a_changed_brightness_is_no_inclusion(monkeypatch: pytest.MonkeyPatch) -> None:
     """Rendered light answers the gain by more than the map's: quick pictures, which have no references, leave
-    the map's error as it was where the gain alone changes, for picture and reference alike."""
+    the map's error as it was where the gain alone changes, for picture and reference alike. Where they would
+    be worse than the noise, what is found is rendered whole again."""
 
     def pair(x: NDArray[np.float64], answer: float) -> NDArray[np.float32]:
         signal = np.array([0.01 * x[0] ** 3, 0.0])
@@ -212,11 +213,17 @@ def test_a_changed_brightness_is_no_inclusion(monkeypatch: pytest.MonkeyPatch) -
 
     monkeypatch.setattr(refining, "expected", expected)
     at = np.array([8.0, 6.0, 80.0, 0.0, 0.0, 0.2])
-    off = refining._off(CHAIN, PRIOR, at, whole, lambda values: whole(values)[:, :1])
+    off = refining.Off(CHAIN, PRIOR, at, whole, lambda values: whole(values)[:, :1])
     brighter, larger = at + np.array([0, 0, 0, 0, 0, 0.3]), at + np.array([0.5, 0, 0, 0, 0, 0])
     assert np.allclose(off(brighter), off(at), atol=1e-6)
     true = pair(larger, 0.022) - pair(larger, 0.02)
     assert np.allclose(off(larger), true, atol=1e-6) and not np.allclose(true[:, 0], off(at)[:, 0], atol=1e-4)
+
+    rough = refining.Off(CHAIN, PRIOR, at, whole, lambda values: 0.97 * whole(values)[:, :1])
+    for sd, again in ((0.5, False), (0.05, True)):  # one standard deviation away, and ten
+        spread = np.diag([sd, 1.0, 1.0, 1.0, 1.0, 1.0]) ** 2
+        rough.look(fitting.Fitted(larger, spread, 1.0, pair(larger, 0.02)))
+        assert np.allclose(rough(larger), true, atol=1e-6) == again
 
 
 @pytest.mark.parametrize("modulus", [60.0, 95.0])

@@ -29,6 +29,7 @@ Single = NDArray[np.float32]
 _RENDERS = 5
 _FIRST = 0.3  # standard deviations that a fit may move after the first rendering, without another
 _ALIKE = 0.1  # counts rms, that references are apart whose difference from the map's is the same
+_FAR = 3.0  # standard deviations that a fit moves from what was rendered whole, to be rendered so again
 _SHORT = 1e-3  # of the prior's spread: a way that tells nothing of how the error changes
 _REMAINS = 0.01  # of the map's error after its correction nearby (see `tests/test_refining.py`)
 _AS_WELL = 1.05  # times wider by the map's error a posterior may be without any rendering
@@ -48,7 +49,7 @@ class Refined:
     explains : whether noise explains the rest, up to `_LOUDEST` times the variance that is known of: a camera
         may be noisier than told. If not, these pictures are not what is rendered.
     renders : how many specimens were rendered.
-    off : by how much rendered pictures are above the chain's at unknowns (5 + q,); None where none was.
+    off : by how much rendered pictures are above the chain's; None where none was.
     """
 
     samples: Floats
@@ -56,7 +57,7 @@ class Refined:
     near: Near
     explains: bool
     renders: int
-    off: Callable[[Floats], Single] | None
+    off: Off | None
 
 
 def refine(
@@ -101,10 +102,12 @@ def refine(
             still = flat(found.x, np.zeros_like(found.pictures))
             return Refined(followed.draw(prior, samples, seed), found, still, True, 0, None)
     known = None if begin is None else begin.off
-    off = known or _off(chain, prior, found.x, render, quick)
+    off = known or Off(chain, prior, found.x, render, quick)
+    off.look(found)
     remains = _REMAINS**2 * _as_here(features, error, found.pictures, off(found.x)) * error + always
     for renders in range(1, _RENDERS + 1):  # noqa: B007
         at = found.x
+        off.look(found)
         near = _corrected(near, at, off(at), prior)
         found = fit(chain, features, prior, observed, frames, at, remains, near)
         moved = float((np.abs(found.x - at) / np.sqrt(np.diag(found.covariance)))[:5].max())
@@ -120,45 +123,54 @@ def refine(
     return Refined(drawn, found, near, explains, renders + more, off)
 
 
-def _off(
-    chain: Chain,
-    prior: Prior,
-    at: Floats,
-    render: Callable[[Mapping[str, float]], Single],
-    quick: Callable[[Mapping[str, float]], Single] | None,
-) -> Callable[[Floats], Single]:
+class Off:
     """By how much rendered pictures are above the chain's at unknowns (5 + q,).
 
-    Quickly, from what was rendered ``at`` a specimen, as long as the references are about as they are there:
-    along the valley only the inclusion changes, which they do not show. What else changes a little is left
-    as it was: it moves picture and reference alike, and their difference would pass for an inclusion's.
+    Quickly, from what was rendered whole at one specimen, as long as the references are about as they are
+    there: along the valley only the inclusion changes, which they do not show. What else changes a little is
+    left as it was: it moves picture and reference alike, and their difference would pass for an inclusion's.
     """
-    aside = any(name in prior.names for name in ALIGNMENT)
-    begins: list[Single] = []
 
-    def whole(x: Floats) -> tuple[Floats, Single, Single]:
-        """What is rendered at a specimen, from which others are told quickly."""
-        values, plain = prior.values(x), expected(chain, prior, [x])[0]
-        begins.clear()
-        return x, plain, np.asarray(placed(render(values)[None], [values])[0] - plain, np.float32)
+    def __init__(
+        self,
+        chain: Chain,
+        prior: Prior,
+        at: Floats,
+        render: Callable[[Mapping[str, float]], Single],
+        quick: Callable[[Mapping[str, float]], Single] | None,
+    ) -> None:
+        self._chain, self._prior, self._render = chain, prior, render
+        self._quick = None if any(name in prior.names for name in ALIGNMENT) else quick
+        self.whole(at)
 
-    at, plain, first = whole(at)
+    def whole(self, x: Floats) -> Single:
+        """Render a specimen whole, from which others are told quickly."""
+        values = self._prior.values(x)
+        self._at, self._plain = x, expected(self._chain, self._prior, [x])[0]
+        seen = placed(self._render(values)[None], [values])[0]
+        self._first = np.asarray(seen - self._plain, np.float32)
+        self._begins: Single | None = None
+        return self._first
 
-    def off(x: Floats) -> Single:
-        nonlocal at, plain, first
-        if np.array_equal(x, at):
-            return first
-        seen = expected(chain, prior, [x])[0]
-        if quick is None or aside or np.sqrt(np.mean((seen - plain)[:, 1] ** 2)) > _ALIKE:
-            at, plain, first = whole(x)
-            return first
-        if not begins:
-            begins.append((first + plain)[:, :1] - quick(prior.values(at)))
-        alone = np.concatenate([x[: len(PARAMETERS)], at[len(PARAMETERS) :]])
-        pressed = begins[0] + quick(prior.values(alone)) - expected(chain, prior, [alone])[0][:, :1]
-        return np.concatenate([pressed, first[:, 1:]], axis=1)
+    def look(self, found: Fitted) -> None:
+        """Render whole again what is found, where quick pictures from the last would be worse than the noise:
+        means of many exposures are found far, by their measure, from where the map or one of them led."""
+        away = np.abs(found.x - self._at) / np.sqrt(np.diag(found.covariance))
+        if away[: len(PARAMETERS)].max() > _FAR:
+            self.whole(found.x)
 
-    return off
+    def __call__(self, x: Floats) -> Single:
+        if np.array_equal(x, self._at):
+            return self._first
+        seen = expected(self._chain, self._prior, [x])[0]
+        if self._quick is None or np.sqrt(np.mean((seen - self._plain)[:, 1] ** 2)) > _ALIKE:
+            return self.whole(x)
+        if self._begins is None:
+            self._begins = (self._first + self._plain)[:, :1] - self._quick(self._prior.values(self._at))
+        alone = np.concatenate([x[: len(PARAMETERS)], self._at[len(PARAMETERS) :]])
+        plain = expected(self._chain, self._prior, [alone])[0][:, :1]
+        pressed = self._begins + self._quick(self._prior.values(alone)) - plain
+        return np.concatenate([pressed, self._first[:, 1:]], axis=1)
 
 
 def _without_error(
