@@ -72,7 +72,8 @@ def chain(monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.setattr(fitting, "pictures", lambda c, i, values: np.float32([blob(one) for one in values]))
     monkeypatch.setattr(fitting, "Brightness", SimpleNamespace(of=lambda chain, values: values))
     monkeypatch.setattr(fitting, "covariance", lambda *a: np.eye(2 * ROWS * COLUMNS) * 0.05**2)
-    return SimpleNamespace(gain=lambda values: 1.0)
+    specimen = SimpleNamespace(modulus_kPa=6.0)
+    return SimpleNamespace(gain=lambda values: 1.0, design=SimpleNamespace(specimen=specimen))
 
 
 def test_where_the_camera_stands_is_found(chain: Any) -> None:

@@ -253,7 +253,7 @@ def covariance(
 ) -> Floats:
     """Return the covariance (k, k) of the features' noise in pictures (levels, 2, r, c) of so many exposures.
 
-    References are the mean of `imagined.REFERENCE_FRAMES` at least. ``pattern`` is that of `Prior`; it is
+    References are the mean of `posterior.REFERENCE_FRAMES` at least. ``pattern`` is that of `Prior`; it is
     the same in all pictures. ``rounded`` tells that expected pictures have what rounding does to blocks.
     """
     variance = mean_variance(chain.design, seen[None], np.array([gain]), frames, rounded=rounded)[0]
