@@ -71,7 +71,7 @@ def chain(monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.setattr(fitting, "_inputs", lambda c, p, many: (np.zeros(0), [p.values(x) for x in many]))
     monkeypatch.setattr(fitting, "pictures", lambda c, i, values: np.float32([blob(one) for one in values]))
     monkeypatch.setattr(fitting, "Brightness", SimpleNamespace(of=lambda chain, values: values))
-    monkeypatch.setattr(fitting, "covariance", lambda *a: np.eye(2 * ROWS * COLUMNS) * 0.05**2)
+    monkeypatch.setattr(fitting, "covariance", lambda *a, **b: np.eye(2 * ROWS * COLUMNS) * 0.05**2)
     specimen = SimpleNamespace(modulus_kPa=6.0)
     return SimpleNamespace(gain=lambda values: 1.0, design=SimpleNamespace(specimen=specimen))
 
