@@ -113,8 +113,10 @@ def test_noise_alone_explains_what_is_not_rendered_at_the_truth(
         values = values_of(corpus, own, number, levels)
         light, gain = rendered(chain, own.traced, values), chain.gain(values)
         for frames in (1, 100):
-            seen = stored(own, corpus, number, levels) if frames == 1 else None
-            seen = averaged(own, corpus, number, levels, frames, 0) if seen is None else seen
+            if frames == 1:
+                seen = stored(own, corpus, number, levels)
+            else:
+                seen = averaged(own, corpus, number, levels, frames, 0)
             for known in (False, True):
                 told = light + known * rounding(chain.design, light, np.array(gain))
                 noise = covariance(chain, features, light, gain, frames, rounded=known)
