@@ -103,12 +103,12 @@ def refine(
             return Refined(followed.draw(prior, samples, seed), found, still, True, 0, None)
     known = None if begin is None else begin.off
     off = known or Off(chain, prior, found.x, render, quick)
-    off.look(found)
-    remains = _REMAINS**2 * _as_here(features, error, found.pictures, off(found.x)) * error + always
-    for renders in range(1, _RENDERS + 1):  # noqa: B007
+    here = off.look(found)
+    remains = _REMAINS**2 * _as_here(features, error, found.pictures, here) * error + always
+    for renders in range(1, _RENDERS + 1):
         at = found.x
-        off.look(found)
-        near = _corrected(near, at, off(at), prior)
+        here = here if renders == 1 else off.look(found)
+        near = _corrected(near, at, here, prior)
         found = fit(chain, features, prior, observed, frames, at, remains, near)
         moved = float((np.abs(found.x - at) / np.sqrt(np.diag(found.covariance)))[:5].max())
         enough = NEAR if len(near.slopes) else _FIRST
@@ -152,12 +152,12 @@ class Off:
         self._begins: Single | None = None
         return self._first
 
-    def look(self, found: Fitted) -> None:
-        """Render whole again what is found, where quick pictures from the last would be worse than the noise:
-        means of many exposures are found far, by their measure, from where the map or one of them led."""
+    def look(self, found: Fitted) -> Single:
+        """The same where a fit ends; rendered whole where quick pictures from the last would be worse than
+        the noise: means of exposures are found far, by their measure, from where the map or one of them led.
+        """
         away = np.abs(found.x - self._at) / np.sqrt(np.diag(found.covariance))
-        if away[: len(PARAMETERS)].max() > _FAR:
-            self.whole(found.x)
+        return self.whole(found.x) if away[: len(PARAMETERS)].max() > _FAR else self(found.x)
 
     def __call__(self, x: Floats) -> Single:
         if np.array_equal(x, self._at):
