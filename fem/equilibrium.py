@@ -35,12 +35,13 @@ _NEWTON = 20  # steps at most
 _PATIENCE = 12  # steps after which the residual must have come down to a hundredth of the reaction
 _DAMPING, _STRONGEST = 0.05, 0.8  # share of the stiffness at rest added where the tangent is not definite
 _WORTH = 15  # iterations of conjugate gradients that are worth a new factor
-_TURNS = 12  # of the slab's mesh and the slopes at most
+_TURNS = 20  # of the slab's mesh and the slopes at most
 _STRICT = 8  # turns after which the probe's edge may still want to move by more
 _MEMORY = 5  # turns that the next one is extrapolated from
 _SLIP, _RIM_SLIP = 2e-4, 2e-3  # mm by which the mesh may still want to move: inside, and at the probe's edge
 _OFF = 1e-4  # share of the largest force by which forces may still change
 _LOOSE = 3e-4  # tolerance while mesh and slopes still change
+_EASY, _TIGHT = 6, 3e-6  # turns so loose, and tolerance after: what they are extrapolated from is small then
 _SETS = 40  # changes of the active set at most
 
 
@@ -173,7 +174,7 @@ def equilibrium(body: Body, guess: State) -> State:
             state = _realign(state, known)
             turns += 1
         before = state.force
-        state = _newton(body, state, _TOLERANCE if settled else _LOOSE)
+        state = _newton(body, state, _TOLERANCE if settled else _LOOSE if turns <= _EASY else _TIGHT)
         distance = state.tie.gap(state.model.place + state.moved)
         pulls = state.closed & (state.force < 0)
         overlaps = ~state.closed & (distance < 0)
@@ -269,16 +270,23 @@ def _newton(body: Body, start: State, tolerance: float) -> State:
 def _step(
     body: Body, start: State, sys: System, moved: Floats, load: Floats, renew: bool, damping: float
 ) -> tuple[tuple[Floats, int, float], float]:
-    """Newton's step as `_solve` gives it, with at least so much damping, and the damping it took."""
+    """Newton's step as `_solve` gives it, with at least so much damping, and the damping it took.
+
+    Where no damping makes the tangent definite, the stiffness at rest takes its place: a pair that has just
+    closed leaves volumes beside it that are far off, and their pressure says nothing yet.
+    """
     tangent = body.tangent(start.model, moved)
     while True:
         matrices: Matrices = tangent
-        if damping > 0 and isinstance(tangent, Tangent):
+        if damping > _STRONGEST:
+            matrices, renew = body.rest, True
+        elif damping > 0 and isinstance(tangent, Tangent):
             matrices = tangent.stored.plus(damping, body.rest)
         try:
-            return _solve(body, start.model, sys, start.tie, matrices, load, renew), damping
+            found = _solve(body, start.model, sys, start.tie, matrices, load, renew)
+            return found, min(damping, _STRONGEST)
         except (Indefinite, np.linalg.LinAlgError):
-            if not start.model.finite or damping >= _STRONGEST:
+            if not start.model.finite or damping > _STRONGEST:
                 raise
             damping, renew = max(4 * damping, _DAMPING), True
 

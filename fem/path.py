@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,6 +21,7 @@ _LONGEST = 1.0  # mm of indentation in one step at finite strain
 _SECANT, _FORCE = 25, 1e-6  # steps to find a force, and how well to meet it
 _CUTS = 6  # halvings of a step at most
 _GROWTH = 1.5  # of a step after one that held
+_DEAR = 8  # factors after which the next step is half as long: its tangents were hardly ever definite
 
 
 @dataclass
@@ -42,33 +44,44 @@ class Path:
         NotConverged
             If even the shortest step fails.
         """
-        if self.beside is not None:
-            try:
-                other = self.beside.to(indentation)
-                self.states.append(equilibrium(self.body, self._aside(other)))
-                return self.states[-1]
-            except (NotConverged, Inverted, np.linalg.LinAlgError):
-                pass  # go all the way on its own feet
         near = min(self.states, key=lambda s: abs(s.indentation - indentation))
-        shortest = max(abs(indentation - near.indentation), 1e-3) / 2**_CUTS
+        way = indentation - near.indentation
         longest = _LONGEST if near.model.finite else np.inf  # small strain does not depend on its way
-        step = float(np.clip(indentation - near.indentation, -longest, longest))
+        # what an inclusion adds to a press without hardly does either
+        step = way if self.beside is not None else float(np.clip(way, -longest, longest))
         while near.indentation != indentation:
             left = indentation - near.indentation
             target = indentation if abs(step) >= abs(left) * (1 - 1e-9) else near.indentation + step
-            try:
-                near = equilibrium(self.body, self._ahead(near, target))
-            except (NotConverged, Inverted, np.linalg.LinAlgError):
+            spent = self.body.effort.factors
+            found = self._next(near, target)
+            if found is not None:
+                near = found
+                self.states.append(near)
+                step *= _GROWTH if self.body.effort.factors - spent <= _DEAR else 0.5
+            elif abs(step) / 2 >= max(abs(way), 1e-3) / 2**_CUTS:
                 step /= 2
-                if abs(step) < shortest:
-                    raise NotConverged(
-                        f"press: no equilibrium found beyond {near.indentation:.3g} mm on the way to "
-                        f"{indentation:.3g} mm"
-                    ) from None
-                continue
-            self.states.append(near)
-            step = float(np.clip(_GROWTH * step, -longest, longest))
+            else:
+                raise NotConverged(
+                    f"press: no equilibrium found beyond {near.indentation:.3g} mm on the way to "
+                    f"{indentation:.3g} mm"
+                )
+            step = float(np.clip(step, -longest, longest))
         return near
+
+    def _next(self, near: State, indentation: float) -> State | None:
+        """Equilibrium at an indentation beyond `near`, by the first guess that leads to one."""
+        guesses: list[Callable[[], State]] = []
+        if self.beside is not None:
+            other = self.beside.to(indentation)
+            guesses.append(lambda: self._aside(other))
+        if not near.model.finite or abs(indentation - near.indentation) <= _LONGEST:
+            guesses.append(lambda: self._ahead(near, indentation))
+        for guess in guesses:
+            try:
+                return equilibrium(self.body, guess())
+            except (NotConverged, Inverted, np.linalg.LinAlgError):
+                continue
+        return None
 
     def _ahead(self, near: State, indentation: float) -> State:
         """Extrapolate the path to an indentation, on the mesh that follows the slip expected there."""

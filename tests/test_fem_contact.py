@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 import fem
+from fem.equilibrium import equilibrium
+from fem.mesh import QUALITIES, Geometry
+from fem.meshed import build
+from fem.path import path
 from fem.pressing import Mechanics
+from fem.solver import one_thread
 
 Floats = NDArray[np.float64]
 
@@ -49,6 +56,37 @@ def test_a_dome_opens_at_its_corners(mechanics: Mechanics) -> None:
         assert gap.min() >= -1e-9
         assert np.abs(state.force * gap).max() <= 1e-10 * state.force.max()
         assert not state.closed[-1, -1] and state.closed[0, 0]
+
+
+@pytest.mark.parametrize("rise", [0.4, -0.4])
+def test_a_pair_that_is_pushed_far_in_comes_back(rise: float) -> None:
+    """As pairs that have just closed are: volumes beside them are so far off that no tangent is definite."""
+    geometry = Geometry(PROBE, SLAB)
+    with one_thread():
+        way = path(geometry, build(geometry, QUALITIES["preview"], True), False)
+        state = way.to(1.0)
+        moved = state.moved.copy()
+        moved[state.model.interface.slab[5, 5], 2] += rise
+        back = equilibrium(way.body, replace(state, moved=moved))
+    np.testing.assert_allclose(back.moved, state.moved, atol=1e-4)
+    assert back.force.sum() == pytest.approx(state.force.sum(), rel=1e-4)  # as far as turns settle
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_a_dome_closes_on_its_way_down() -> None:
+    """The probe's corners come down between 2 and 3 mm; the answer does not depend on the way there, and what
+    presses on the probe presses on the chest wall."""
+    dome, slab = fem.Probe(25, LAYERS, dome_radius_mm=100), fem.Slab(60, 60, 5)
+    ball = fem.Inclusion(10, 5, 100)
+    several = fem.press(dome, slab, ball, [2.0, 3.0], estimate=False)
+    (once,) = fem.press(dome, slab, ball, [3.0], estimate=False)
+    assert [one.path for one in several] == ["unilateral", "sliding"]
+    for name in ("displacement", "displacement_0"):
+        np.testing.assert_allclose(once.surface[name], several[1].surface[name], atol=5e-4)
+    assert once.force_N == pytest.approx(several[1].force_N, rel=1e-5)
+    for one in several:
+        assert one.chest_force_N == pytest.approx(one.force_N, rel=1e-6)
 
 
 @pytest.mark.slow
