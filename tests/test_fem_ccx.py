@@ -142,10 +142,12 @@ def test_finite_where_contact_spreads(
 @pytest.mark.parametrize("inclusion", INCLUSIONS, ids=str)
 def test_finite_deep_under_a_dome(tmp_path: Path, inclusion: fem.Inclusion) -> None:
     """6 mm, all closed: a dome spares the corners that end flat presses, and a thick slab the tissue between
-    inclusion and chest wall. Totals are printed: what they gather near the edge CalculiX settles to 2 %."""
+    inclusion and chest wall. Totals fall short under small inclusions: which code is off is not known."""
     geometry = Geometry(fem.Probe(25, PROBE.layers, dome_radius_mm=100), fem.Slab(60, 60, 5), inclusion)
-    ((top, _, force, _),) = compared(tmp_path, geometry, [6.0], "finite", "standard", COARSE_EDGE)
+    ((top, _, force, inner),) = compared(tmp_path, geometry, [6.0], "finite", "standard", COARSE_EDGE)
     assert abs(top) < 0.02 and abs(force) < 0.02
+    if abs(inner) >= 0.03:
+        pytest.xfail(f"total without the outermost row {inner:+.1%} apart, goal 3 %")
 
 
 @pytest.mark.parametrize(
