@@ -6,9 +6,10 @@ brick with reduced integration (Dhondt 2004; [dhondt2004]), which does not lock 
 neo-Hookean material, with frictionless face-to-face contact that slides and opens.
 
 CalculiX finds which places face each other at the start of an increment, and keeps them to its end: its
-contact is right to first order in the last increment's slip, which is a per cent of the tared displacement
-and more. So each level is followed by `SETTLE` steps of the same travel. Where those still swing from one to
-the next, as the corners of a flat probe make them from 2 mm on, the mean of the last two is the answer.
+contact is right to first order in the last increment's slip. So increments are short (`STRIDE`), and each
+level is followed by `SETTLE` steps of the same travel. What they begin with must be small: deep presses come
+back to equilibrium in swings that hardly die out, or grow. Where they still swing from one to the next, the
+mean of the last two is the answer.
 
 Run a deck with `ccx -i NAME` (without the `.inp`); displacements of the probe's contact nodes and the chest
 wall's reaction come in `NAME.dat` for every step, fields for viewing in `NAME.frd`. Units are mm, mN, kPa.
@@ -38,6 +39,9 @@ Mechanics = Literal["linear", "finite"]
 
 STIFFNESS = 1e3
 """Of the contact, kPa per mm of overlap: ten times more changes the tared displacement by 0.1 %."""
+
+STRIDE = 0.25
+"""Longest increment of a finite press, mm."""
 
 SETTLE = 3
 """Steps of the same travel after each level of a finite press."""
@@ -213,6 +217,7 @@ def write(
     element: str = "C3D20R",
     stiffness: float = STIFFNESS,
     settle: int = SETTLE,
+    stride: float = STRIDE,
 ) -> Path:
     """Write the deck of one press.
 
@@ -224,6 +229,8 @@ def write(
         C3D20R or C3D20: CalculiX's name of the brick.
     stiffness
         Of the contact of `finite`, kPa / mm.
+    stride
+        Longest increment of `finite`, mm.
 
     Raises
     ------
@@ -250,8 +257,9 @@ def write(
     out.write("*BOUNDARY\nGLASS, 1, 3\n")
     for i, (_, axis) in enumerate(model.held):
         out.write(f"HELD{i}, {axis + 1}\n")
-    for level in levels:
-        _step(out, model, level, finite, "0.25, 1., 1e-4, 1.")
+    for before, level in zip([model.start, *levels], levels, strict=False):
+        share = _number(min(1.0, stride / (level - before)))
+        _step(out, model, level, finite, f"{share}, 1., 1e-5, {share}")
         for _ in range(settle if finite else 0):
             _step(out, model, level, finite, "1., 1.")
     path.write_text(out.getvalue(), encoding="ascii")

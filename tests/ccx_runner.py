@@ -41,8 +41,8 @@ class Results:
 class Tared:
     """One level: largest tared displacement over the middle of the probe (µm), its integral over the whole
     and up to `inner_mm` from the middle, without the outermost row of cells (mm³), force with and without
-    inclusion (N), seconds of both runs; `scatter` is half the difference of the last two settling steps, over
-    the maximum."""
+    inclusion (N), seconds of both runs. Each is the mean of the last two settling steps; `scatter` is half
+    their difference, relative, of maximum, total, force and inner total."""
 
     max_um: float
     total_mm3: float
@@ -50,7 +50,7 @@ class Tared:
     inner_mm: float
     force_N: float
     force_0_N: float
-    scatter: float
+    scatter: tuple[float, float, float, float]
     seconds: float
 
 
@@ -106,19 +106,20 @@ def press(
         faces = [_surface(geometry, model, *(g[s] for g in grids)) for s in last]
         scalars = [[tared(face, m) for m in (True, False)] for face in faces]
         inner_mm = float(np.unique(np.round(faces[0].points[:, 0], 6))[-3])  # nodes in the middles of sides
-        force = [1e-3 * share * -(r.reaction[list(last)] @ model.normal).mean() for r in both]
-        top = [middle["max_mm"] for middle, _ in scalars]
+        force, force_0 = (1e-3 * share * -(r.reaction[list(last)] @ model.normal) for r in both)
+        steps = np.array(
+            [
+                [1e3 * middle["max_mm"] for middle, _ in scalars],
+                [whole["total_mm3"] for _, whole in scalars],
+                force,
+                [total_within(face, inner_mm) for face in faces],
+            ]
+        )
+        top, total, pushed, inner = steps.mean(axis=1)
+        scatter = np.ptp(steps, axis=1) / 2 / np.abs(steps.mean(axis=1))
+        seconds = sum(r.seconds for r in both)
         found.append(
-            Tared(
-                1e3 * float(np.mean(top)),
-                float(np.mean([whole["total_mm3"] for _, whole in scalars])),
-                float(np.mean([total_within(face, inner_mm) for face in faces])),
-                inner_mm,
-                force[0],
-                force[1],
-                (max(top) - min(top)) / 2 / float(np.mean(top)),
-                sum(r.seconds for r in both),
-            )
+            Tared(top, total, inner, inner_mm, pushed, float(force_0.mean()), tuple(scatter), seconds)
         )
     return found
 

@@ -62,15 +62,17 @@ def compared(
     for level, we, they in zip(levels, ours, theirs, strict=True):
         top = 1e3 * ccx_runner.tared(we.surface, True)["max_mm"]
         total = ccx_runner.tared(we.surface, False)["total_mm3"]
-        pairs = (("max um", top, they.max_um), ("total mm3", total, they.total_mm3))
         inner = ccx_runner.total_within(we.surface, they.inner_mm)
-        pairs = (*pairs, ("force N", we.force_N, they.force_N))
-        pairs = (*pairs, (f"total of {2 * they.inner_mm:.1f} mm", inner, they.inner_mm3))
-        for name, a, b in pairs:
-            print(
-                f"{mechanics} {geometry.inclusion} {level:g} mm {name}: {a:.4f} / {b:.4f} / {a / b - 1:+.2%}"
-            )
-        print(f"   CalculiX: {they.seconds:.0f} s, scatter {they.scatter:.2%}; ours: {we.seconds:.0f} s")
+        pairs = (
+            ("max um", top, they.max_um),
+            ("total mm3", total, they.total_mm3),
+            ("force N", we.force_N, they.force_N),
+            (f"total of {2 * they.inner_mm:.1f} mm", inner, they.inner_mm3),
+        )
+        for (name, a, b), swing in zip(pairs, they.scatter, strict=True):
+            print(f"{mechanics} {geometry.inclusion} {level:g} mm {name}: ", end="")
+            print(f"{a:.4f} / {b:.4f} (± {swing:.2%} of settling): {a / b - 1:+.2%}")
+        print(f"   CalculiX: {they.seconds:.0f} s; ours: {we.seconds:.0f} s")
         found.append(tuple(a / b - 1 for _, a, b in pairs))
     return found  # type: ignore[return-value]
 

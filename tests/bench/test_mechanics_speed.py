@@ -19,6 +19,7 @@ from lone_press import BALL, LEVEL_MM, PROBE, SLAB, by_ours
 from test_fem_convergence import REFINED
 
 import fem
+from fem import ccx
 from fem.mesh import QUALITIES, Geometry
 from fem.solver import Factor
 from fem.spheres import QUALITIES as SPHERES
@@ -297,12 +298,13 @@ def test_finite_strain(tmp_path: Path) -> None:
     if CCX.find() is None:
         print("CalculiX (ccx) is neither installed nor in .ccx: its row is left out")
         return
+    bodies = ccx.bodies(Geometry(PROBE, SLAB, BALL), QUALITIES["standard"])
     for levels in ([1.0, 2.0, 3.0], [1.0, 2.0]):
         total, why = 0.0, ""
         for bare in (False, True):
-            deck = fem.deck(
-                tmp_path / f"{len(levels)}{bare}.inp", PROBE, SLAB, BALL, levels, without_inclusion=bare
-            )
+            body = bodies.without_inclusion() if bare else bodies
+            # increments as long as it can take: shorter ones are for accuracy
+            deck = ccx.write(tmp_path / f"{len(levels)}{bare}.inp", body, levels, stride=0.5)
             start = time.perf_counter()
             try:
                 ccx_runner.run(deck, timeout=900)
