@@ -200,6 +200,20 @@ def test_chest_wall_moves_along_the_tilted_axis(tmp_path: Path) -> None:
     np.testing.assert_allclose(moved, (found.start - 1) * found.normal)
 
 
+def test_increments_are_short(tmp_path: Path) -> None:
+    """A level is reached by steps of one length, none longer than it may be, from where the bodies stand."""
+    model = ccx.bodies(Geometry(PROBE, SLAB, INCLUSIONS[0], Pose((0.0, 2.0))), COARSE_EDGE)
+    levels = [0.1, 1.0, 3.0]
+    text = ccx.write(tmp_path / "a.inp", model, levels, settle=0).read_text()
+    rows = [line.split("\n", 1)[0].split(",") for line in text.split("*STATIC\n")[1:]]
+    ways = np.diff([model.start, *levels])
+    assert model.start < 0
+    for row, way in zip(rows, ways, strict=True):
+        first, whole, least, longest = map(float, row)
+        assert first == longest <= whole == 1 and least < first / 100
+        assert longest * way == pytest.approx(min(way, ccx.STRIDE))
+
+
 def test_numbers_are_short_enough_for_calculix(tmp_path: Path) -> None:
     """It reads twenty characters of each: what is beyond, an exponent too, would be lost."""
     found = ccx.bodies(Geometry(PROBE, SLAB, INCLUSIONS[0], Pose((0.0, 2.0))), COARSE_EDGE)

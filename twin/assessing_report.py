@@ -159,4 +159,10 @@ def _curve(page: Page, curve: Mapping[str, Any] | None, folder: Path) -> None:
         "exposure, by the fit alone, without rendering. The bound knows the ranges' spread, not their ends.",
         [len(rows) - 1],
     )
-    page.picture((folder / CURVED).read_bytes(), "The same, over the number of samples.")
+    chance = 100 / (2 * curve["tested"]) ** 0.5
+    page.picture(
+        (folder / CURVED).read_bytes(),
+        f"The same, over the number of samples. Bars: {chance:.0f} %, the standard error of a root mean "
+        f"square of {curve['tested']} normal errors; points share their inclusions, so that steps are known "
+        "better.",
+    )

@@ -150,9 +150,10 @@ def _draw(record: dict[str, Any], place: Path) -> None:
     sizes = [row["samples"] for row in record["curve"]]
     labels = ("size d / mm", "depth h / mm", "modulus E / kPa")
     for number, (axis, label) in enumerate(zip(axes, labels, strict=True)):
-        axis.semilogx(
-            sizes, [row["rmse"][number] for row in record["curve"]], "o-", color=BLUE, label="fit alone"
-        )
+        rmse = np.array([row["rmse"][number] for row in record["curve"]])
+        chance = rmse / np.sqrt(2 * record["tested"])
+        axis.errorbar(sizes, rmse, chance, fmt="o-", color=BLUE, capsize=2, label="fit alone")
+        axis.set_xscale("log")
         axis.axhline(record["bound"][number], color=RED, lw=1.0, label="bound")
         axis.set(xlabel="samples that light was learned from", ylabel=f"RMSE of {label}")
         axis.set_xticks(sizes, [str(size) for size in sizes])

@@ -303,7 +303,7 @@ def test_finite_strain(tmp_path: Path) -> None:
         total, why = 0.0, ""
         for bare in (False, True):
             body = bodies.without_inclusion() if bare else bodies
-            # increments as long as it can take: shorter ones are for accuracy
+            # accuracy asks for twice as many increments, which would only slow the peer
             deck = ccx.write(tmp_path / f"{len(levels)}{bare}.inp", body, levels, stride=0.5)
             start = time.perf_counter()
             try:
