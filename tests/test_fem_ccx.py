@@ -148,6 +148,7 @@ def test_finite_deep_under_a_dome(tmp_path: Path, inclusion: fem.Inclusion) -> N
     geometry = Geometry(fem.Probe(25, PROBE.layers, dome_radius_mm=100), fem.Slab(60, 60, 5), inclusion)
     ((top, _, force, inner),) = compared(tmp_path, geometry, [6.0], "finite", "standard", COARSE_EDGE)
     assert abs(top) < 0.02 and abs(force) < 0.02
+    assert abs(inner) < 0.15  # 0.09 and 0.13 were the worst
     if abs(inner) >= 0.03:
         pytest.xfail(f"total without the outermost row {inner:+.1%} apart, goal 3 %")
 
