@@ -16,6 +16,7 @@ the tangent is the stiffness of linear elasticity.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -109,21 +110,44 @@ def forces(quad: Quadrature, moved: Floats, shear: Floats, bulk: Floats) -> tupl
     """
     out, energy = np.empty((quad.size, NODES, 3)), 0.0
     for part in _chunks(quad.size):
-        gradient, f, inverse, det = _deform(quad, part, moved)
-        stress, mean = _deviator(f, det, shear[part])
-        pressure = _pressure(quad, part, det, bulk[part])
-        guard = _guard(shear[part], bulk[part])[:, None] * (det - 1) ** 3
-        # half p (J - 1) integrates to the projected energy, since p is in the space projected onto
-        stored = 1.5 * (mean - shear[part][:, None]) + (0.5 * pressure + 0.25 * guard) * (det - 1)
-        pressure += guard
-        energy += float((quad.weight[part] * stored).sum())
-        stress += (pressure * det)[..., None, None] * np.eye(3)
-        # first Piola-Kirchhoff stress P = tau F^-T, weighted
-        piola = (stress @ inverse.transpose(0, 1, 3, 2)) * quad.weight[part][..., None, None]
-        n, q = det.shape
-        flat = gradient.transpose(0, 2, 1, 3).reshape(n, NODES, 3 * q)
+        at = _points(quad, part, moved, shear[part], bulk[part])
+        energy += float((quad.weight[part] * at.stored).sum())
+        # first Piola-Kirchhoff stress, weighted
+        piola = at.piola * quad.weight[part][..., None, None]
+        n, q = at.det.shape
+        flat = at.gradient.transpose(0, 2, 1, 3).reshape(n, NODES, 3 * q)
         out[part] = flat @ piola.transpose(0, 3, 1, 2).reshape(n, 3 * q, 3)
     return out, energy
+
+
+@dataclass(frozen=True)
+class Points:
+    """At the quadrature points of n elements: gradients of the shape functions (n, 3, 27, q), F (n, q, 3, 3)
+    and its determinant (n, q), projected pressure (n, q) kPa, first Piola-Kirchhoff stress P = tau F^-T (n,
+    q, 3, 3) kPa, energy per undeformed volume (n, q) kPa."""
+
+    gradient: Floats
+    f: Floats
+    det: Floats
+    pressure: Floats
+    piola: Floats
+    stored: Floats
+
+
+def points(quad: Quadrature, moved: Floats, shear: Floats, bulk: Floats) -> Points:
+    """State of few elements; parameters as of `forces`."""
+    return _points(quad, slice(None), moved, shear, bulk)
+
+
+def _points(quad: Quadrature, part: slice, moved: Floats, shear: Floats, bulk: Floats) -> Points:
+    gradient, f, inverse, det = _deform(quad, part, moved)
+    stress, mean = _deviator(f, det, shear)
+    pressure = _pressure(quad, part, det, bulk)
+    guard = _guard(shear, bulk)[:, None] * (det - 1) ** 3
+    # half p (J - 1) integrates to the projected energy, since p is in the space projected onto
+    stored = 1.5 * (mean - shear[:, None]) + (0.5 * pressure + 0.25 * guard) * (det - 1)
+    stress += ((pressure + guard) * det)[..., None, None] * np.eye(3)
+    return Points(gradient, f, det, pressure, stress @ inverse.transpose(0, 1, 3, 2), stored)
 
 
 def linear_forces(quad: Quadrature, local: Floats, shear: Floats, bulk: Floats) -> Floats:

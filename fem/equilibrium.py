@@ -20,6 +20,7 @@ from scipy.sparse.linalg import LinearOperator, cg
 from fem import elasticity, solver
 from fem.contact import Tie
 from fem.elasticity import Inverted
+from fem.material_forces import material_forces
 from fem.meshed import Model
 from fem.operators import AtRest, Matrices, Sheared, Tangent, product
 from fem.system import System
@@ -42,6 +43,7 @@ _SLIP, _RIM_SLIP = 2e-4, 2e-3  # mm by which the mesh may still want to move: in
 _OFF = 1e-4  # share of the largest force by which forces may still change
 _LOOSE = 3e-4  # tolerance while mesh and slopes still change
 _EASY, _TIGHT = 6, 3e-6  # turns so loose, and tolerance after: what they are extrapolated from is small then
+_FAINT = 1e-3  # share of the largest force below which a pair does not tell its slope
 _SETS = 40  # changes of the active set at most
 
 
@@ -171,7 +173,7 @@ def equilibrium(body: Body, guess: State) -> State:
     known: list[tuple[Floats, Floats]] = []
     for _ in range(_SETS):
         if not settled:
-            state = _realign(state, known)
+            state = _realign(body, state, known, turns == 0)
             turns += 1
         before = state.force
         state = _newton(body, state, _TOLERANCE if settled else _LOOSE if turns <= _EASY else _TIGHT)
@@ -210,16 +212,19 @@ def equilibrium(body: Body, guess: State) -> State:
     raise NotConverged("the set of closed contact pairs does not settle")
 
 
-def _realign(state: State, known: list[tuple[Floats, Floats]]) -> State:
+def _realign(body: Body, state: State, known: list[tuple[Floats, Floats]], guessed: bool) -> State:
     """Move the slab's mesh to where the probe's nodes stand now, and take their slopes.
 
     The turns are accelerated (Anderson 1965; [anderson1965]): from 4 mm on, where the pressure is no longer
     small against the tissue's modulus, plain ones would drift off to both sides of the answer.
     """
-    model, place = state.model, state.model.place + state.moved
-    slope = model.interface.slope(place)
+    model, energy = state.model, state.model.normals == "energy"
     if not state.tie.slope.any():  # the first of all
+        slope = model.interface.slope(model.place + state.moved)
         return replace(state, tie=replace(state.tie, slope=slope))
+    if energy and guessed:  # out of equilibrium forces say nothing: the slope is a guess, too
+        return replace(state, model=model.follow(model.wanted(state.moved)))
+    slope = _slope(body, state) if energy else model.interface.slope(model.place + state.moved)
     now = np.concatenate([model.shift, state.tie.slope]).ravel()
     asked = np.concatenate([model.wanted(state.moved), slope]).ravel() - now
     known.append((now, asked))
@@ -230,6 +235,31 @@ def _realign(state: State, known: list[tuple[Floats, Floats]]) -> State:
         answer -= (dx + df) @ np.linalg.lstsq(df, asked, rcond=1e-8)[0]
     shift, slope = answer.reshape(2, *slope.shape)
     return replace(state, model=model.follow(shift), tie=replace(state.tie, slope=slope))
+
+
+def _slope(body: Body, state: State) -> Floats:
+    """Slopes of the face by which the slab's material gains no energy by sliding along it, (nx, ny, 2).
+
+    The slab's force f there asks for the slope of f + T^-T c, c its material force and T the stretch of the
+    face: where it is free to slide, c along the face is nothing. Pairs that carry next to nothing keep the
+    slope of the probe's face, and so do those at its corners, which would fold from 3 mm on.
+    """
+    model, now = state.model, state.model.place + state.moved
+    face, under = model.interface, model.nodes.under
+    slope, at = face.slope(now), face.slab
+    quad, shear, bulk = model.quad.part(under), body.shear[under], body.bulk[under]
+    force = model.gather(quad.nodes, elasticity.forces(quad, state.moved, shear, bulk)[0])[at]
+    drive = model.gather(quad.nodes, material_forces(quad, model.place, state.moved, shear, bulk))[at]
+    before, after = (face.derivatives(place[at])[..., :2] for place in (model.place, now))
+    back = np.linalg.solve(after, before)  # T^-T, by derivatives along the undeformed face
+    along = force[..., :2] + (back @ drive[..., :2, None])[..., 0]
+    for axis, symmetric in enumerate(model.layout.symmetric):
+        if symmetric:
+            np.moveaxis(along, axis, 0)[0, :, axis] = 0.0
+    up = force[..., 2]
+    told = state.closed & ~face.corners & (up > 0)
+    trust = np.where(told, up / (up**2 + (_FAINT * up.max()) ** 2), 0.0)[..., None]
+    return np.asarray(slope - trust * (along + up[..., None] * slope))
 
 
 def _newton(body: Body, start: State, tolerance: float) -> State:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ from fem.topology import Layout, Resolution, materials
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
+Normals = Literal["recovered", "energy"]
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,7 @@ class Model:
     normal: Floats  # direction of the press in the probe's frame, (3,)
     ball: NDArray[np.int64]  # elements of the inclusion
     finite: bool  # finite strain with sliding contact, or linear elasticity
+    normals: Normals = "recovered"  # whence the directions of contact forces
 
     @cached_property
     def quad(self) -> Quadrature:
@@ -70,7 +73,11 @@ class Model:
 
     def nodal(self, forces: Floats) -> Floats:
         """Sum of element forces (m, 27, 3) at the nodes, (nodes, 3)."""
-        dofs = (3 * self.nodes.cells[:, :, None] + np.arange(3)).ravel()
+        return self.gather(self.nodes.cells, forces)
+
+    def gather(self, cells: NDArray[np.int64], forces: Floats) -> Floats:
+        """The same of some elements with nodes (m, 27)."""
+        dofs = (3 * cells[:, :, None] + np.arange(3)).ravel()
         total = np.bincount(dofs, weights=forces.ravel(), minlength=self.place.size)
         return np.asarray(total, dtype=float).reshape(-1, 3)
 
@@ -102,7 +109,13 @@ class Model:
         return replace(self, place=place, shift=shift)
 
 
-def build(geometry: Geometry, res: Resolution, finite: bool, layout: Layout | None = None) -> Model:
+def build(
+    geometry: Geometry,
+    res: Resolution,
+    finite: bool,
+    layout: Layout | None = None,
+    normals: Normals = "recovered",
+) -> Model:
     """Mesh a geometry; `layout`: with less symmetry than it has."""
     layout = layout or geometry.layout(res)
     slab, probe = mesh.morph_slab(layout, geometry), mesh.morph_probe(layout, geometry)
@@ -120,6 +133,7 @@ def build(geometry: Geometry, res: Resolution, finite: bool, layout: Layout | No
         mesh.rotation(geometry.pose.tilt_deg).T[:, 2],
         np.flatnonzero(materials(layout) == 1),
         finite,
+        normals,
     )
 
 

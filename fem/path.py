@@ -105,7 +105,12 @@ class Path:
                 for i in range(len(x))
             ]
             moved = np.asarray(sum(w * s.moved for w, s in zip(weights, known, strict=True)))
-            shift = np.asarray(sum(w * s.model.shift for w, s in zip(weights, known, strict=True)))
+            shift, slope = (
+                np.asarray(sum(w * each for w, each in zip(weights, of, strict=True)))
+                for of in ([s.model.shift for s in known], [s.tie.slope for s in known])
+            )
+            if near.model.normals == "energy":
+                near = replace(near, tie=replace(near.tie, slope=slope))
         guess = replace(near, indentation=indentation, moved=moved)
         return replace(guess, model=near.model.follow(shift)) if near.model.finite else guess
 
@@ -169,6 +174,9 @@ class Path:
                 s.indentation - self.states[0].indentation
             )
             difference, slip = scale * (s.moved - o.moved), scale * (s.model.shift - o.model.shift)
+            if other.model.normals == "energy":
+                turned = scale * (s.tie.slope - o.tie.slope)
+                other = replace(other, tie=replace(other.tie, slope=other.tie.slope + turned))
         elif other.closed.all() and self.states[0].closed.all():
             rates = [p.rate() for p in (self, self.beside)]
             difference = (rates[0] - rates[1]) * other.indentation

@@ -33,6 +33,7 @@ class Nodes:
     held: Bools  # (nodes, 3)
     slab: int  # number of the slab's nodes
     slab_cells: int
+    under: Ints  # the slab's elements that the footprint's nodes belong to
     centres: Floats  # logical middles of the elements, the probe hung on the slab, (m, 3)
 
 
@@ -61,6 +62,7 @@ def nodes(layout: Layout, sides: str) -> Nodes:
     cells = [m.dofs.element_dofs.T.astype(np.int64) for m in (slab, probe)]
     middles = [m.p[:, m.t].mean(axis=1) for m in (slab, probe)]
     middles[1][2] += slab.p[2].min()  # hang the probe on the slab, so that neighbours are neighbours
+    footprint = np.isin(cells[0], under).any(axis=1)
     return Nodes(
         np.vstack([cells[0], cells[1] + split]),
         _as_grid(under, place),
@@ -69,6 +71,7 @@ def nodes(layout: Layout, sides: str) -> Nodes:
         held,
         split,
         len(cells[0]),
+        np.flatnonzero(footprint),
         np.hstack(middles).T,
     )
 
