@@ -110,7 +110,7 @@ def forces(quad: Quadrature, moved: Floats, shear: Floats, bulk: Floats) -> tupl
     """
     out, energy = np.empty((quad.size, NODES, 3)), 0.0
     for part in _chunks(quad.size):
-        at = _points(quad, part, moved, shear[part], bulk[part])
+        at = points(quad, moved, shear[part], bulk[part], part)
         energy += float((quad.weight[part] * at.stored).sum())
         # first Piola-Kirchhoff stress, weighted
         piola = at.piola * quad.weight[part][..., None, None]
@@ -134,12 +134,8 @@ class Points:
     stored: Floats
 
 
-def points(quad: Quadrature, moved: Floats, shear: Floats, bulk: Floats) -> Points:
-    """State of few elements; parameters as of `forces`."""
-    return _points(quad, slice(None), moved, shear, bulk)
-
-
-def _points(quad: Quadrature, part: slice, moved: Floats, shear: Floats, bulk: Floats) -> Points:
+def points(quad: Quadrature, moved: Floats, shear: Floats, bulk: Floats, part: slice = slice(None)) -> Points:
+    """State of a part of the elements, of few; `shear` and `bulk` (n,) are theirs, kPa."""
     gradient, f, inverse, det = _deform(quad, part, moved)
     stress, mean = _deviator(f, det, shear)
     pressure = _pressure(quad, part, det, bulk)
