@@ -74,20 +74,22 @@ class Interface:
     @property
     def inner(self) -> Bools:
         """Pairs off the faces along the probe's edge, (nx, ny)."""
-        x, y = (
-            (np.arange(n) < n - 3) & (half | (np.arange(n) > 2))
-            for n, half in zip(self.slab.shape, self.symmetric, strict=True)
-        )
-        return np.asarray(x[:, None] & y)
+        x, y = self._outermost(3)
+        return np.asarray(~x[:, None] & ~y)
 
     @property
     def corners(self) -> Bools:
         """Pairs in the faces at the probe's corners, less the lines that they share, (nx, ny)."""
+        x, y = self._outermost(2)
+        return np.asarray(x[:, None] & y)
+
+    def _outermost(self, count: int) -> tuple[Bools, Bools]:
+        """Lines among so many next to the probe's edge, along x (nx,) and y (ny,)."""
         x, y = (
-            (np.arange(n) >= n - 2) | (~np.bool_(half) & (np.arange(n) < 2))
+            (np.arange(n) >= n - count) | ((np.arange(n) < count) & (not half))
             for n, half in zip(self.slab.shape, self.symmetric, strict=True)
         )
-        return np.asarray(x[:, None] & y)
+        return x, y
 
     def slip(self, place: Floats) -> Floats:
         """How far the probe's nodes lie beside their partners at places (nodes, 3); (nx, ny, 2) mm."""

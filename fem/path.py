@@ -104,13 +104,13 @@ class Path:
                 np.prod([(indentation - x[j]) / (x[i] - x[j]) for j in range(len(x)) if j != i])
                 for i in range(len(x))
             ]
-            moved = np.asarray(sum(w * s.moved for w, s in zip(weights, known, strict=True)))
-            shift, slope = (
-                np.asarray(sum(w * each for w, each in zip(weights, of, strict=True)))
-                for of in ([s.model.shift for s in known], [s.tie.slope for s in known])
-            )
+
+            def between(fields: list[Floats]) -> Floats:
+                return np.asarray(sum(w * field for w, field in zip(weights, fields, strict=True)))
+
+            moved, shift = between([s.moved for s in known]), between([s.model.shift for s in known])
             if near.model.normals == "energy":
-                near = replace(near, tie=replace(near.tie, slope=slope))
+                near = replace(near, tie=replace(near.tie, slope=between([s.tie.slope for s in known])))
         guess = replace(near, indentation=indentation, moved=moved)
         return replace(guess, model=near.model.follow(shift)) if near.model.finite else guess
 
