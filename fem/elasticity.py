@@ -68,11 +68,36 @@ def slopes(quad: Quadrature, moved: Floats) -> Floats:
     return np.asarray((local[:, None] @ quad.gradient(slice(None))).transpose(0, 3, 2, 1))
 
 
-def _pressure(quad: Quadrature, part: slice, det: Floats, bulk: Floats) -> Floats:
-    """Projected volumetric stress p, tension positive, kPa; shape (n, q)."""
-    modes = quad.modes[part]
-    volume = (modes * (quad.weight[part] * (det - 1))[:, None]).sum(axis=2)
-    return bulk[:, None] * (volume[:, None] @ modes)[:, 0]
+def _project(quad: Quadrature, part: slice, change: Floats) -> Floats:
+    """Projection of a change of volume (n, q) onto the pressure's modes, (n, 4) mm^3/2."""
+    return np.asarray((quad.modes[part] @ (quad.weight[part] * change)[:, :, None])[..., 0])
+
+
+def _pressure(quad: Quadrature, part: slice, volume: Floats, bulk: Floats) -> Floats:
+    """Volumetric stress p of a projected change of volume (n, 4), tension positive, kPa; shape (n, q)."""
+    return np.asarray(bulk[:, None] * (volume[:, None] @ quad.modes[part])[:, 0])
+
+
+def volumes(quad: Quadrature, moved: Floats, change: Floats) -> Floats:
+    """Each element's projected change of volume J - 1 after a change of the displacements, if it were linear.
+
+    Parameters
+    ----------
+    moved, change
+        Displacement of the nodes, and its change, (nodes, 3) mm.
+
+    Returns
+    -------
+    (m, 4) array, mm^3/2: of the modes 1, x, y, z, orthonormal in the element.
+    """
+    out = np.empty((quad.size, 4))
+    for part in _chunks(quad.size):
+        gradient, _, inverse, det = _deform(quad, part, moved)
+        local = change[quad.nodes[part]].transpose(0, 2, 1)
+        slope = (local[:, None] @ gradient).transpose(0, 3, 1, 2)  # (n, q, b, a): of du_a along X_b
+        rate = det * np.einsum("nqba,nqba->nq", inverse, slope)
+        out[part] = _project(quad, part, det - 1 + rate)
+    return out
 
 
 def _guard(shear: Floats, bulk: Floats) -> Floats:
@@ -138,7 +163,7 @@ def points(quad: Quadrature, moved: Floats, shear: Floats, bulk: Floats, part: s
     """State of a part of the elements, of few; `shear` and `bulk` (n,) are theirs, kPa."""
     gradient, f, inverse, det = _deform(quad, part, moved)
     stress, mean = _deviator(f, det, shear)
-    pressure = _pressure(quad, part, det, bulk)
+    pressure = _pressure(quad, part, _project(quad, part, det - 1), bulk)
     guard = _guard(shear, bulk)[:, None] * (det - 1) ** 3
     # half p (J - 1) integrates to the projected energy, since p is in the space projected onto
     stored = 1.5 * (mean - shear[:, None]) + (0.5 * pressure + 0.25 * guard) * (det - 1)
@@ -197,8 +222,12 @@ def stiffness(
     moved: Floats | None = None,
     elements: NDArray[np.int64] | None = None,
     dtype: DTypeLike = np.float64,
+    volume: Floats | None = None,
 ) -> NDArray[np.floating]:
     """Tangent stiffness of each element, the derivative of `forces`.
+
+    With `volume`, its pressure is that of another change of volume than the displacements': the tangent of
+    the mixed form, in which the pressure is an unknown of its own.
 
     Parameters
     ----------
@@ -210,6 +239,8 @@ def stiffness(
         Which elements, (n,); all of them by default.
     dtype
         Of the result and of most of the work.
+    volume
+        Projected change of volume of each of the elements asked for, (n, 4) mm^3/2, as of `volumes`.
 
     Returns
     -------
@@ -220,18 +251,27 @@ def stiffness(
     out = np.empty((quad.size, DOFS, DOFS), dtype)
     still = np.zeros((int(quad.nodes.max()) + 1, 3)) if moved is None else moved
     for part in _chunks(quad.size):
-        _stiffness(quad, part, still, shear[part], bulk[part], out[part])
+        some = None if volume is None else volume[part]
+        _stiffness(quad, part, still, shear[part], bulk[part], some, out[part])
     return out
 
 
 def _stiffness(
-    quad: Quadrature, part: slice, moved: Floats, shear: Floats, bulk: Floats, out: NDArray[np.floating]
+    quad: Quadrature,
+    part: slice,
+    moved: Floats,
+    shear: Floats,
+    bulk: Floats,
+    volume: Floats | None,
+    out: NDArray[np.floating],
 ) -> None:
     gradient, f, inverse, det = _deform(quad, part, moved)
     n, q = det.shape
     weight = quad.weight[part]
     stress, mean = _deviator(f, det, shear)
-    pressure = (_pressure(quad, part, det, bulk) + _guard(shear, bulk)[:, None] * (det - 1) ** 3) * det
+    if volume is None:
+        volume = _project(quad, part, det - 1)
+    pressure = (_pressure(quad, part, volume, bulk) + _guard(shear, bulk)[:, None] * (det - 1) ** 3) * det
     guard = 3 * _guard(shear, bulk)[:, None] * ((det - 1) * det) ** 2
     kind = out.dtype
     # spatial gradients g = F^-T grad N: (n, 27, 3, q), then flat as (n, 81, q), dof = 3 * node + axis

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import LinearOperator, cg
 
 from fem import elasticity, solver
+from fem.anderson import Anderson
 from fem.contact import Tie
 from fem.elasticity import Inverted
 from fem.material_forces import material_forces
@@ -35,10 +36,9 @@ _HALVINGS = 8  # of a Newton step at most
 _NEWTON = 20  # steps at most
 _PATIENCE = 12  # steps after which the residual must have come down to a hundredth of the reaction
 _DAMPING, _STRONGEST = 0.05, 0.8  # share of the stiffness at rest added where the tangent is not definite
-_WORTH = 15  # iterations of conjugate gradients that are worth a new factor
+_WORTH = 8  # iterations of conjugate gradients that are worth a new factor
 _TURNS = 20  # of the slab's mesh and the slopes at most
 _STRICT = 8  # turns after which the probe's edge may still want to move by more
-_MEMORY = 5  # turns that the next one is extrapolated from
 _SLIP, _RIM_SLIP = 2e-4, 2e-3  # mm by which the mesh may still want to move: inside, and at the probe's edge
 _OFF = 1e-4  # share of the largest force by which forces may still change
 _LOOSE = 3e-4  # tolerance while mesh and slopes still change
@@ -66,6 +66,7 @@ class State:
     chest: Floats  # of the slab on the chest wall, (3,) mN
     model: Model  # the mesh it belongs to
     tie: Tie
+    volume: Floats | None = None  # change of volume that the last Newton step foresaw, (elements, 4) mm^3/2
 
 
 @dataclass
@@ -89,6 +90,7 @@ class Body:
     stiff: bool  # with the inclusion
     factors: dict[bytes, Preconditioner] = field(default_factory=dict)
     effort: Effort = field(default_factory=Effort)
+    turns: Anderson = field(default_factory=Anderson)  # of the slab's mesh and the contact's slopes
 
     @cached_property
     def floor(self) -> float:
@@ -104,11 +106,11 @@ class Body:
         total = model.nodal(product(self.rest, moved, model))
         return total, 0.5 * float((total * moved).sum())
 
-    def tangent(self, model: Model, moved: Floats) -> AtRest | Tangent:
-        """Tangent stiffness of the elements."""
+    def tangent(self, model: Model, moved: Floats, volume: Floats | None = None) -> AtRest | Tangent:
+        """Tangent stiffness of the elements; with the pressures of a change of volume, if one is given."""
         if not model.finite:
             return self.rest
-        return Tangent(model.quad, self.shear, self.bulk, moved)
+        return Tangent(model.quad, self.shear, self.bulk, moved, volume)
 
     def factor(
         self, sys: System, matrices: Matrices, slope: Floats | None = None, renew: bool = False
@@ -170,13 +172,14 @@ def equilibrium(body: Body, guess: State) -> State:
     state.moved[held] = np.where(held, guess.model.chest(guess.indentation), 0.0)[held]
     seen: set[bytes] = set()
     turns, settled = 0, not guess.model.finite
-    known: list[tuple[Floats, Floats]] = []
+    body.turns.begin()
     for _ in range(_SETS):
         if not settled:
-            state = _realign(body, state, known, turns == 0)
+            state = _realign(body, state, turns == 0)
             turns += 1
         before = state.force
-        state = _newton(body, state, _TOLERANCE if settled else _LOOSE if turns <= _EASY else _TIGHT)
+        tolerance = _TOLERANCE if settled else _LOOSE if turns <= _EASY else _TIGHT
+        state = _newton(body, state, tolerance, renew=turns == 1)
         distance = state.tie.gap(state.model.place + state.moved)
         pulls = state.closed & (state.force < 0)
         overlaps = ~state.closed & (distance < 0)
@@ -206,13 +209,13 @@ def equilibrium(body: Body, guess: State) -> State:
             closed[at] = ~closed[at]
             key = closed.tobytes()
         seen.add(key)
-        known.clear()
+        body.turns.forget()
         state = replace(state, closed=closed)
         body.effort.sets += 1
     raise NotConverged("the set of closed contact pairs does not settle")
 
 
-def _realign(body: Body, state: State, known: list[tuple[Floats, Floats]], guessed: bool) -> State:
+def _realign(body: Body, state: State, guessed: bool) -> State:
     """Move the slab's mesh to where the probe's nodes stand now, and take their slopes.
 
     The turns are accelerated (Anderson 1965; [anderson1965]): from 4 mm on, where the pressure is no longer
@@ -227,13 +230,7 @@ def _realign(body: Body, state: State, known: list[tuple[Floats, Floats]], guess
     slope = _slope(body, state) if energy else model.interface.slope(model.place + state.moved)
     now = np.concatenate([model.shift, state.tie.slope]).ravel()
     asked = np.concatenate([model.wanted(state.moved), slope]).ravel() - now
-    known.append((now, asked))
-    answer = now + asked
-    if len(known) > 1:
-        x, f = (np.stack(part, axis=1) for part in zip(*known[-_MEMORY:], strict=True))
-        dx, df = np.diff(x, axis=1), np.diff(f, axis=1)
-        answer -= (dx + df) @ np.linalg.lstsq(df, asked, rcond=1e-8)[0]
-    shift, slope = answer.reshape(2, *slope.shape)
+    shift, slope = body.turns.next(now, asked).reshape(2, *slope.shape)
     return replace(state, model=model.follow(shift), tie=replace(state.tie, slope=slope))
 
 
@@ -262,23 +259,25 @@ def _slope(body: Body, state: State) -> Floats:
     return np.asarray(slope - trust * (along + up[..., None] * slope))
 
 
-def _newton(body: Body, start: State, tolerance: float) -> State:
+def _newton(body: Body, start: State, tolerance: float, renew: bool) -> State:
     """Equilibrium for a given set of closed pairs, mesh and slopes."""
-    model, closed, moved, bond = start.model, start.closed, start.moved, start.tie
+    model, closed, moved, bond, volume = start.model, start.closed, start.moved, start.tie, start.volume
     sys = model.system(closed)
     tip, at_chest = model.nodes.tip, model.nodes.chest
     model.settle(moved, closed, bond)
     forces, energy = body.forces(model, moved)
-    renew, damping = False, 0.0
+    damping = 0.0
     for turn in range(_NEWTON):
         normal = np.where(closed, forces[tip, 2], 0.0)
         residual = sys.gather(bond.hand_on(forces, normal))
         size, scale = float(np.linalg.norm(residual)), float(np.linalg.norm(forces[at_chest]))
         if size <= max(tolerance * scale, body.floor):
-            return replace(start, moved=moved, force=-normal, chest=-forces[at_chest].sum(axis=0))
+            chest = -forces[at_chest].sum(axis=0)
+            return replace(start, moved=moved, force=-normal, chest=chest, volume=volume)
         if turn >= _PATIENCE and damping == 0 and size > 1e-2 * scale:
             raise NotConverged("Newton's method does not come down")
-        (change, steps, downhill), damping = _step(body, start, sys, moved, -residual, renew, damping)
+        tangent = body.tangent(model, moved, volume)
+        (change, steps, downhill), damping = _step(body, start, sys, tangent, -residual, renew, damping)
         renew = model.finite and (steps > _WORTH or damping > 0)
         damping = damping / 4 if damping > _DAMPING else 0.0
         body.effort.newton += 1
@@ -293,19 +292,26 @@ def _newton(body: Body, start: State, tolerance: float) -> State:
                 break
         else:
             raise NotConverged("no step lowers the energy")
+        if model.finite:
+            volume = elasticity.volumes(model.quad, moved, trial - moved)
         moved, forces, energy = trial, forces_t, energy_t
     raise NotConverged("Newton's method does not converge")
 
 
 def _step(
-    body: Body, start: State, sys: System, moved: Floats, load: Floats, renew: bool, damping: float
+    body: Body,
+    start: State,
+    sys: System,
+    tangent: AtRest | Tangent,
+    load: Floats,
+    renew: bool,
+    damping: float,
 ) -> tuple[tuple[Floats, int, float], float]:
     """Newton's step as `_solve` gives it, with at least so much damping, and the damping it took.
 
     Where no damping makes the tangent definite, the stiffness at rest takes its place: a pair that has just
     closed leaves volumes beside it that are far off, and their pressure says nothing yet.
     """
-    tangent = body.tangent(start.model, moved)
     while True:
         matrices: Matrices = tangent
         if damping > _STRONGEST:

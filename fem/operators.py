@@ -77,6 +77,7 @@ class Tangent:
     shear: Floats
     bulk: Floats
     moved: Floats
+    volume: Floats | None = None  # that pressures are taken from, instead of the displacements' own; (m, 4)
 
     @cached_property
     def stored(self) -> Stiffness:
@@ -96,8 +97,12 @@ class Tangent:
         vars(self).pop("stored", None)
 
     def _made(self, elements: Ints | None) -> NDArray[np.floating]:
-        shear, bulk = (all_ if elements is None else all_[elements] for all_ in (self.shear, self.bulk))
-        return elasticity.stiffness(self.quad, shear, bulk, self.moved, elements, np.float32)
+        shear, bulk, volume = (
+            all_ if elements is None or all_ is None else all_[elements]
+            for all_ in (self.shear, self.bulk, self.volume)
+        )
+        assert shear is not None and bulk is not None
+        return elasticity.stiffness(self.quad, shear, bulk, self.moved, elements, np.float32, volume)
 
 
 @dataclass(frozen=True)

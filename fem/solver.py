@@ -24,6 +24,7 @@ from threadpoolctl import ThreadpoolController
 
 from fem.elimination import factorise, room
 from fem.fronts import Tree, plan
+from fem.heap import keep
 
 __all__ = ["Factor", "Tree", "apply", "one_thread", "plan"]
 
@@ -55,6 +56,7 @@ _controller: list[ThreadpoolController] = []
 @contextmanager
 def one_thread() -> Iterator[None]:
     """Hold BLAS to one thread, so that its sums are always taken in the same order."""
+    keep()
     if not _controller:
         _controller.append(ThreadpoolController())
     with _controller[0].limit(limits=1, user_api="blas"):
