@@ -221,13 +221,13 @@ def _realign(body: Body, state: State, guessed: bool) -> State:
     The turns are accelerated (Anderson 1965; [anderson1965]): from 4 mm on, where the pressure is no longer
     small against the tissue's modulus, plain ones would drift off to both sides of the answer.
     """
-    model, energy = state.model, state.model.normals == "energy"
+    model = state.model
     if not state.tie.slope.any():  # the first of all
         slope = model.interface.slope(model.place + state.moved)
         return replace(state, tie=replace(state.tie, slope=slope))
-    if energy and guessed:  # out of equilibrium forces say nothing: the slope is a guess, too
+    if guessed:  # out of equilibrium forces say nothing: the slope is a guess, too
         return replace(state, model=model.follow(model.wanted(state.moved)))
-    slope = _slope(body, state) if energy else model.interface.slope(model.place + state.moved)
+    slope = _slope(body, state)
     now = np.concatenate([model.shift, state.tie.slope]).ravel()
     asked = np.concatenate([model.wanted(state.moved), slope]).ravel() - now
     shift, slope = body.turns.next(now, asked).reshape(2, *slope.shape)

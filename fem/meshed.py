@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +17,6 @@ from fem.topology import Layout, Resolution, materials
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-Normals = Literal["recovered", "energy"]
 
 
 @dataclass(frozen=True)
@@ -35,7 +33,6 @@ class Model:
     normal: Floats  # direction of the press in the probe's frame, (3,)
     ball: NDArray[np.int64]  # elements of the inclusion
     finite: bool  # finite strain with sliding contact, or linear elasticity
-    normals: Normals = "recovered"  # whence the directions of contact forces
 
     @cached_property
     def quad(self) -> Quadrature:
@@ -114,7 +111,6 @@ def build(
     res: Resolution,
     finite: bool,
     layout: Layout | None = None,
-    normals: Normals = "recovered",
 ) -> Model:
     """Mesh a geometry; `layout`: with less symmetry than it has."""
     layout = layout or geometry.layout(res)
@@ -133,7 +129,6 @@ def build(
         mesh.rotation(geometry.pose.tilt_deg).T[:, 2],
         np.flatnonzero(materials(layout) == 1),
         finite,
-        normals,
     )
 
 

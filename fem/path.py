@@ -109,8 +109,7 @@ class Path:
                 return np.asarray(sum(w * field for w, field in zip(weights, fields, strict=True)))
 
             moved, shift = between([s.moved for s in known]), between([s.model.shift for s in known])
-            if near.model.normals == "energy":
-                near = replace(near, tie=replace(near.tie, slope=between([s.tie.slope for s in known])))
+            near = replace(near, tie=replace(near.tie, slope=between([s.tie.slope for s in known])))
         guess = replace(near, indentation=indentation, moved=moved)
         return replace(guess, model=near.model.follow(shift)) if near.model.finite else guess
 
@@ -174,9 +173,8 @@ class Path:
                 s.indentation - self.states[0].indentation
             )
             difference, slip = scale * (s.moved - o.moved), scale * (s.model.shift - o.model.shift)
-            if other.model.normals == "energy":
-                turned = scale * (s.tie.slope - o.tie.slope)
-                other = replace(other, tie=replace(other.tie, slope=other.tie.slope + turned))
+            turned = scale * (s.tie.slope - o.tie.slope)
+            other = replace(other, tie=replace(other.tie, slope=other.tie.slope + turned))
         elif other.closed.all() and self.states[0].closed.all():
             rates = [p.rate() for p in (self, self.beside)]
             difference = (rates[0] - rates[1]) * other.indentation

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, get_args, overload
+from typing import Literal, overload
 
 import numpy as np
 import pyvista as pv
@@ -17,7 +17,7 @@ from fem.contact_fields import TOO_UNEVEN, contact_of
 from fem.equilibrium import NotConverged as Stuck
 from fem.equilibrium import State
 from fem.mesh import Geometry
-from fem.meshed import Normals, build, moduli
+from fem.meshed import build, moduli
 from fem.model import Inclusion, NotConverged, NotModelled, Pose, Probe, Slab, check
 from fem.path import path
 from fem.solver import one_thread
@@ -132,7 +132,6 @@ def press(
     quality: str = ...,
     tilt: tuple[float, float] = ...,
     position: tuple[float, float] = ...,
-    normals: Normals = ...,
     estimate: bool = ...,
     progress: Progress | None = ...,
 ) -> list[Press]: ...
@@ -147,7 +146,6 @@ def press(
     quality: str = ...,
     tilt: tuple[float, float] = ...,
     position: tuple[float, float] = ...,
-    normals: Normals = ...,
     estimate: bool = ...,
     progress: Progress | None = ...,
 ) -> list[Press]: ...
@@ -163,7 +161,6 @@ def press(
     quality: str = ...,
     tilt: tuple[float, float] = ...,
     position: tuple[float, float] = ...,
-    normals: Normals = ...,
     estimate: bool = ...,
     progress: Progress | None = ...,
 ) -> Press: ...
@@ -178,7 +175,6 @@ def press(
     quality: str = "standard",
     tilt: tuple[float, float] = (0.0, 0.0),
     position: tuple[float, float] = (0.0, 0.0),
-    normals: Normals = "recovered",
     estimate: bool = True,
     progress: Progress | None = None,
 ) -> Press | list[Press]:
@@ -201,9 +197,6 @@ def press(
         Rotation of the probe about x, then y, through the middle of its contact surface, degrees.
     position
         The probe's centre minus the slab's, mm. `inclusion.offset` stays relative to the probe.
-    normals
-        Directions of contact forces at finite strain: "recovered" from the probe's face, as in emulators, or
-        from the tissue's "energy" (`fem.material_forces`), which is right at the probe's edge, too.
     estimate
         False leaves out the estimate of the discretisation error (NaN), which takes a coarser solution.
     progress
@@ -226,11 +219,8 @@ def press(
     levels, by_force, several = _levels(indentation, force)
     _known("quality", quality, mesh.QUALITIES)
     _known("mechanics", mechanics, MECHANICS)
-    _known("normals", normals, get_args(Normals))
     geometry = _geometry(probe, slab, inclusion, tilt, position)
-    answers = _presses(
-        [geometry], levels, by_force, mechanics, mesh.QUALITIES[quality], normals, estimate, progress
-    )
+    answers = _presses([geometry], levels, by_force, mechanics, mesh.QUALITIES[quality], estimate, progress)
     (found,) = answers
     return found if several else found[0]
 
@@ -246,7 +236,6 @@ def press_moduli(
     quality: str = "standard",
     tilt: tuple[float, float] = (0.0, 0.0),
     position: tuple[float, float] = (0.0, 0.0),
-    normals: Normals = "recovered",
     estimate: bool = True,
     progress: Progress | None = None,
 ) -> list[list[Press]]:
@@ -259,11 +248,8 @@ def press_moduli(
     levels, _, _ = _levels(indentation, None)
     _known("quality", quality, mesh.QUALITIES)
     _known("mechanics", mechanics, MECHANICS)
-    _known("normals", normals, get_args(Normals))
     several = [_geometry(probe, slab, replace(inclusion, modulus=float(m)), tilt, position) for m in moduli]
-    return list(
-        _presses(several, levels, False, mechanics, mesh.QUALITIES[quality], normals, estimate, progress)
-    )
+    return list(_presses(several, levels, False, mechanics, mesh.QUALITIES[quality], estimate, progress))
 
 
 def _known(name: str, value: str, allowed: object) -> None:
@@ -308,7 +294,6 @@ def _presses(
     by_force: bool,
     mechanics: Mechanics,
     res: Resolution,
-    normals: Normals,
     estimate: bool,
     progress: Progress | None,
 ) -> Iterator[list[Press]]:
@@ -326,7 +311,7 @@ def _presses(
     first = geometries[0]
     try:
         with one_thread():
-            model = build(first, res, mechanics == "finite", normals=normals)
+            model = build(first, res, mechanics == "finite")
             bare = path(first, model, False)
             step("without inclusion")
             paths = [bare if g.inclusion is None else path(g, model, True, bare) for g in geometries]

@@ -129,7 +129,6 @@ def solved(
             quality=quality,
             tilt=design.press.tilt_deg,
             position=design.press.position_mm,
-            normals="recovered",  # as emulators have them, and so estimators
             estimate=estimate,
             progress=None if tell is None else lambda stage, share: tell(stage, own * share),
         )
