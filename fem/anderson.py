@@ -18,7 +18,9 @@ class Anderson:
     """Extrapolates x -> x + f(x) to f = 0 by the latest steps (Anderson 1965; [anderson1965]), those of an
     earlier problem among them."""
 
-    steps: list[tuple[Floats, Floats]] = field(default_factory=list)  # of x and of f, over the latter's length
+    steps: list[tuple[Floats, Floats]] = field(
+        default_factory=list
+    )  # of x and of f, over the latter's length
     last: tuple[Floats, Floats] | None = None
 
     def begin(self) -> None:

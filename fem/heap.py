@@ -6,7 +6,8 @@ import ctypes
 from functools import cache
 
 _MMAP_THRESHOLD, _TRIM_THRESHOLD = -3, -1  # of glibc's malloc.h
-_LARGE, _SPARE = 8 << 20, 32 << 20  # bytes: an array that is handed back all the same, and what is kept of others
+_LARGE = 8 << 20  # bytes of an array that is handed back all the same
+_SPARE = 32 << 20  # bytes of all others that are kept
 
 
 @cache
