@@ -226,8 +226,9 @@ def stiffness(
 ) -> NDArray[np.floating]:
     """Tangent stiffness of each element, the derivative of `forces`.
 
-    With `volume`, its pressure is that of another change of volume than the displacements': the tangent of
-    the mixed form, in which the pressure is an unknown of its own.
+    With `volume`, its pressure is that of another change of volume than the displacements': so the tangent of
+    the mixed form, in which the pressure is an unknown of its own, is had without one (Magisano, Leonetti and
+    Garcea 2017; [magisano2017]).
 
     Parameters
     ----------

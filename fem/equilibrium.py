@@ -2,7 +2,9 @@
 set.
 
 The tangent is applied element by element and never assembled; a Cholesky factor of an earlier tangent
-(`fem.solver`) preconditions it, so that most Newton steps need no factorisation at all. Which pairs of
+(`fem.solver`) preconditions it, so that most Newton steps need no factorisation at all. Its pressure is the
+one that the last step foresaw: displacements that are extrapolated, or off for what is still to come, change
+volumes by what nearly incompressible tissue answers with pressures that are not there. Which pairs of
 contact nodes are closed is iterated around it (primal-dual active set: Hüeber and Wohlmuth 2005;
 [hueber2005]): closed pairs that pull are opened, open pairs that overlap are closed, until neither is left.
 At finite strain the slab's mesh and the contact's slopes are iterated with it (`fem.contact`).
