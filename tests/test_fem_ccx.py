@@ -12,7 +12,6 @@ from debian_fetch import CCX
 import fem
 from fem import ccx
 from fem.mesh import Geometry
-from fem.meshed import Normals
 from fem.model import Pose
 from fem.topology import Resolution
 
@@ -44,7 +43,6 @@ def compared(
     mechanics: ccx.Mechanics,
     quality: str,
     res: Resolution | str,
-    normals: Normals = "recovered",
 ) -> list[tuple[float, float, float, float]]:
     """Relative differences of tared maximum, total, force, and total without the outermost row of
     CalculiX's cells at each level, printed with both values."""
@@ -57,7 +55,6 @@ def compared(
         quality=quality,
         tilt=geometry.pose.tilt_deg,
         position=geometry.pose.position_mm,
-        normals=normals,
         estimate=False,
     )
     theirs = ccx_runner.press(folder, geometry, levels, mechanics, res)

@@ -170,7 +170,6 @@ def test_refused_inclusions(inclusion: fem.Inclusion, kind: type[ValueError], sa
         ({"indentation": float("nan")}, "indentation"),
         ({"force": 0.0}, "force"),
         ({"indentation": 1.0, "quality": "best"}, "quality"),
-        ({"indentation": 1.0, "normals": "smooth"}, "normals"),
     ],
 )
 def test_refused_presses(given: dict[str, object], says: str) -> None:
