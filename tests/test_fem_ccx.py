@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import ccx_runner
@@ -11,7 +12,7 @@ from debian_fetch import CCX
 
 import fem
 from fem import ccx
-from fem.mesh import Geometry
+from fem.mesh import QUALITIES, Geometry
 from fem.model import Pose
 from fem.topology import Resolution
 
@@ -24,6 +25,7 @@ SLAB = fem.Slab(30, 60, 5)
 # Few cells at the probe's edge: CalculiX loses equilibrium at finer ones, whose corners fold up. They move
 # the tared maximum of a linear press by 0.2 %.
 COARSE_EDGE = Resolution(arc=3, core=1, shell=3, above=3, below=2, edge=2, side=2, layer=2, backing=1)
+GRADED_EDGE = replace(COARSE_EDGE, edge=3, growth=(0.5, 1.6))
 # Its totals of a linear press need fine ones.
 FINE_EDGE = Resolution(4, 1, 4, 3, 2, edge=3, side=4, layer=3, backing=1, growth=(1 / 1.7, 2.2))
 # On those its force under an inclusion off the middle is 0.3 % higher than on these.
@@ -58,6 +60,14 @@ def compared(
         estimate=False,
     )
     theirs = ccx_runner.press(folder, geometry, levels, mechanics, res)
+    print(mechanics, geometry.inclusion)
+    return differences(levels, ours, theirs)
+
+
+def differences(
+    levels: list[float], ours: list[fem.Press], theirs: list[ccx_runner.Tared]
+) -> list[tuple[float, float, float, float]]:
+    """Of each level, as of `compared`."""
     found = []
     for level, we, they in zip(levels, ours, theirs, strict=True):
         top = 1e3 * ccx_runner.tared(we.surface, True)["max_mm"]
@@ -70,7 +80,7 @@ def compared(
             (f"total of {2 * they.inner_mm:.1f} mm", inner, they.inner_mm3),
         )
         for (name, a, b), swing in zip(pairs, they.scatter, strict=True):
-            print(f"{mechanics} {geometry.inclusion} {level:g} mm {name}: ", end="")
+            print(f"{level:g} mm, {name}: ", end="")
             print(f"{a:.4f} / {b:.4f} (± {swing:.2%} of settling): {a / b - 1:+.2%}")
         print(f"   CalculiX: {they.seconds:.0f} s; ours: {we.seconds:.0f} s")
         found.append(tuple(a / b - 1 for _, a, b in pairs))
@@ -140,11 +150,26 @@ def test_finite_where_contact_spreads(
 
 @needs_ccx
 @pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_flat_press_where_the_mesh_slid(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """2 mm on the same mesh, of half a millimetre at the probe's edge, whose nodes end under it: the whole
+    total, too. On nodes that end beside it CalculiX's whole total is 5 % lower."""
+    monkeypatch.setitem(QUALITIES, "standard", GRADED_EDGE)
+    geometry = Geometry(PROBE, SLAB, INCLUSIONS[0])
+    ours = fem.press(PROBE, SLAB, INCLUSIONS[0], [2.0], estimate=False)
+    theirs = ccx_runner.press_slid(tmp_path, geometry, 2.0, GRADED_EDGE)
+    (found,) = differences([2.0], ours, [theirs])
+    assert max(map(abs, found)) < 0.02
+
+
+@needs_ccx
+@pytest.mark.slow
 @pytest.mark.timeout(7200)
 @pytest.mark.parametrize("inclusion", INCLUSIONS, ids=str)
 def test_finite_deep_under_a_dome(tmp_path: Path, inclusion: fem.Inclusion) -> None:
     """6 mm, all closed: a dome spares the corners that end flat presses, and a thick slab the tissue between
-    inclusion and chest wall. Totals of a wide, soft inclusion are apart: which code is off is not known."""
+    inclusion and chest wall. Totals of a wide, soft inclusion are apart, by half of it since CalculiX's nodes
+    slide out from under the probe's edge: on a mesh that ends under it they are 3.8 % on the same cells."""
     geometry = Geometry(fem.Probe(25, PROBE.layers, dome_radius_mm=100), fem.Slab(60, 60, 5), inclusion)
     ((top, _, force, inner),) = compared(
         tmp_path, geometry, [6.0], "finite", "standard", COARSE_EDGE, "energy"
