@@ -18,9 +18,7 @@ class Anderson:
     """Extrapolates x -> x + f(x) to f = 0 by the latest steps (Anderson 1965; [anderson1965]), those of an
     earlier problem among them."""
 
-    steps: list[tuple[Floats, Floats]] = field(
-        default_factory=list
-    )  # of x and of f, over the latter's length
+    steps: list[tuple[Floats, Floats]] = field(default_factory=list)  # of x and f, over the length of f's
     last: tuple[Floats, Floats] | None = None
 
     def begin(self) -> None:

@@ -97,11 +97,10 @@ class Tangent:
         vars(self).pop("stored", None)
 
     def _made(self, elements: Ints | None) -> NDArray[np.floating]:
-        shear, bulk, volume = (
-            all_ if elements is None or all_ is None else all_[elements]
-            for all_ in (self.shear, self.bulk, self.volume)
-        )
-        assert shear is not None and bulk is not None
+        shear, bulk, volume = self.shear, self.bulk, self.volume
+        if elements is not None:
+            shear, bulk = shear[elements], bulk[elements]
+            volume = None if volume is None else volume[elements]
         return elasticity.stiffness(self.quad, shear, bulk, self.moved, elements, np.float32, volume)
 
 

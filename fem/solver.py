@@ -12,8 +12,6 @@ so the bytes do not depend on the number of threads.
 
 from __future__ import annotations
 
-import ctypes
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, Literal, Protocol, runtime_checkable
@@ -22,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
+from fem import heap
 from fem.elimination import factorise, room
 from fem.fronts import Tree, plan
-from fem.heap import keep
 
 __all__ = ["Factor", "Tree", "apply", "one_thread", "plan"]
 
@@ -56,7 +54,7 @@ _controller: list[ThreadpoolController] = []
 @contextmanager
 def one_thread() -> Iterator[None]:
     """Hold BLAS to one thread, so that its sums are always taken in the same order."""
-    keep()
+    heap.keep()
     if not _controller:
         _controller.append(ThreadpoolController())
     with _controller[0].limit(limits=1, user_api="blas"):
@@ -116,7 +114,7 @@ class Factor:
 
     def _factorise(self, progress: Callable[[float], None] | None) -> None:
         self._panels: list[Array] = []  # lets go of those of another precision
-        _trim()
+        heap.trim()  # the factor comes in pieces of its own, not from what was freed
         self._panels = room(self.tree, _KIND[self.precision])
         with one_thread():
             factorise(self.tree, self.matrices, self._panels, progress)
@@ -213,14 +211,6 @@ class Factor:
                 x[:, batch.rows[:, : batch.width]] = found.transpose(2, 0, 1)
         unknowns = x[:, self.tree.order].astype(np.float64)
         return (unknowns.T if load.ndim > 1 else unknowns[0]) * scale
-
-
-def _trim() -> None:
-    """Give memory that was freed back to the system, which glibc does not do by itself: the factor comes in
-    pieces of its own, not from there."""
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
-    if trim is not None:
-        trim(0)
 
 
 def apply(tree: Tree, matrices: Matrices, x: Floats) -> Floats:

@@ -61,17 +61,19 @@ def test_their_own_volumes_leave_the_tangent_as_it_is(model: Model) -> None:
 def test_a_long_step_needs_no_detour(pressed: Path) -> None:
     """From 1 to 2 mm the extrapolated volumes, and so the pressures, are far off: with those pressures the
     tangent is not definite, and steps are damped, each with factors of its own. With those foreseen the same
-    equilibrium takes one factor, and a third of the steps."""
+    equilibrium takes one factor, and fewer steps."""
     body, guess = pressed.body, pressed._ahead(pressed.states[-1], 2.0)
-    taken, found = [], []
+    effort, taken, found = body.effort, [], []
     for start in (
         guess,
         replace(guess, volume=elasticity.volumes(guess.model.quad, guess.moved, 0 * guess.moved)),
     ):
         body.turns.forget()
-        before = body.effort.factors
+        before = effort.factors, effort.newton
         found.append(equilibrium(body, start))
-        taken.append(body.effort.factors - before)
-    assert taken[0] == 1
-    assert taken[1] >= 4
-    np.testing.assert_allclose(found[0].force, found[1].force, rtol=0, atol=3e-4 * found[0].force.max())
+        taken.append((effort.factors - before[0], effort.newton - before[1]))
+    print(taken, np.abs(found[0].force - found[1].force).max() / found[0].force.max())
+    (factors, steps), (more, longer) = taken
+    assert factors == 1 and more >= 4
+    assert steps < 0.75 * longer
+    np.testing.assert_allclose(found[0].force, found[1].force, rtol=0, atol=1e-5 * found[0].force.max())

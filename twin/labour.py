@@ -7,7 +7,6 @@ since it is the run that counts, retries and records it, not Dask.
 
 from __future__ import annotations
 
-import ctypes
 import errno
 import gc
 import logging
@@ -17,7 +16,6 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
@@ -156,26 +154,15 @@ def prepare() -> None:
         os.environ[name] = "1"
     from threadpoolctl import threadpool_limits
 
+    from fem import heap
     from scenes import backend
 
     threadpool_limits(1)  # of libraries that are loaded already
-    _keep_memory()
+    # Dask starts workers with MALLOC_TRIM_THRESHOLD_=65536: whatever a solve frees would go back to the
+    # system at once and come again page by page, which takes as long as the solve
+    heap.keep(32, 256, arenas=1)
     backend.use("cpu")
     backend.threads(1)
-
-
-def _keep_memory() -> None:
-    """Have freed memory stay with the process, where glibc can be told so.
-
-    Dask starts workers with MALLOC_TRIM_THRESHOLD_=65536: whatever a solve frees goes back to the system at
-    once and comes again page by page, which takes as long as the solve.
-    """
-    arena_max, mmap_threshold, trim_threshold = -8, -3, -1  # malloc.h
-    with suppress(OSError, AttributeError):
-        mallopt = ctypes.CDLL(None).mallopt
-        mallopt(arena_max, 1)
-        mallopt(mmap_threshold, 32 * 2**20)  # the most that it takes
-        mallopt(trim_threshold, 256 * 2**20)
 
 
 def sweep() -> None:
@@ -215,12 +202,13 @@ def give_back() -> None:
 
     Dr.Jit keeps all kernels that it ever compiled, a fifth of a MiB each; they are on the disk in any case.
     """
+    from fem import heap
+
     gc.collect()  # cycles of arrays, some tens of MiB between two collections of Python's own
     if drjit := sys.modules.get("drjit"):
         drjit.flush_kernel_cache()
         drjit.flush_malloc_cache()
-    with suppress(OSError, AttributeError):
-        ctypes.CDLL(None).malloc_trim(0)
+    heap.trim()
 
 
 class _Life:
