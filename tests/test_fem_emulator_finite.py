@@ -28,7 +28,7 @@ def deepest(depth: float) -> Plan:
 
 def presses(geometry: Geometry, levels: Sequence[float], mechanics: str) -> list[dict[str, np.ndarray]]:
     """Fields of presses on the coarse mesh, on its grid."""
-    (found,) = _presses([geometry], levels, False, mechanics, COARSE, "recovered", False, None)  # type: ignore[arg-type]
+    (found,) = _presses([geometry], levels, False, mechanics, COARSE, False, None)  # type: ignore[arg-type]
     return [grids(press) for press in found]
 
 
