@@ -10,14 +10,14 @@ Closed contact ties the probe's node to the tangent plane at its partner,
 
     z_probe - z_slab = G . ((x, y)_probe - (x, y)_slab),                                                 (1)
 
-with the slope G of the probe's deformed face, so that forces act along its normal (-G, 1). G and the slab's
-mesh are held fixed while equilibrium is found, then taken anew until they stay (Wriggers 2006, section 6.3;
-[wriggers2006]): each equilibrium is that of two elastic bodies under linear ties, with an energy and a
-symmetric tangent. A pair is closed with a force >= 0, or open with a gap >= 0 (Signorini's conditions).
+with a slope G of the face, so that forces act along its normal (-G, 1). G and the slab's mesh are held fixed
+while equilibrium is found, then taken anew until they stay (Wriggers 2006, section 6.3; [wriggers2006]):
+each equilibrium is that of two elastic bodies under linear ties, with an energy and a symmetric tangent. A
+pair is closed with a force >= 0, or open with a gap >= 0 (Signorini's conditions).
 
-In the cells at the probe's edge, where the face bends sharply under the largest pressure, a slope recovered
-from displacements is that of the cell's middle, too flat: the tissue slides too little, on finer cells, too.
-There the slope is better told by what sliding would change of the stored energy (`fem.material_forces`).
+G is that by which the tissue's material gains no energy by sliding on (`fem.material_forces`). A slope
+recovered from displacements begins; in the cells at the probe's edge, where the face bends sharply under the
+largest pressure, it is that of the cell's middle, too flat: the tissue slides too little, on finer cells, too.
 """
 
 from __future__ import annotations
