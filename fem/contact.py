@@ -17,7 +17,7 @@ pair is closed with a force >= 0, or open with a gap >= 0 (Signorini's condition
 
 G is that by which the tissue's material gains no energy by sliding on (`fem.material_forces`). A slope
 recovered from displacements begins; in the cells at the probe's edge, where the face bends sharply under the
-largest pressure, it is that of the cell's middle, too flat: the tissue slides too little, on finer cells, too.
+largest pressure, it is that of the cell's middle, too flat: tissue slides too little, on finer cells, too.
 """
 
 from __future__ import annotations
