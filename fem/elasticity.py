@@ -26,7 +26,7 @@ from fem.quadrature import BY_REFERENCE, DOFS, NODES, Quadrature
 Floats = NDArray[np.float64]
 
 _GUARD = 50.0  # shear moduli at most
-_CHUNK = 128  # elements at a time: their temporaries stay in the cache
+_CHUNK = 128  # elements at a time
 
 
 class Inverted(ArithmeticError):
@@ -38,7 +38,8 @@ def lame(modulus: Floats, poisson: Floats) -> tuple[Floats, Floats]:
     return modulus / (2 * (1 + poisson)), modulus / (3 * (1 - 2 * poisson))
 
 
-def _chunks(elements: int) -> Iterator[slice]:
+def chunks(elements: int) -> Iterator[slice]:
+    """Parts of all elements, each so few that its temporaries stay in the cache."""
     return (slice(start, min(start + _CHUNK, elements)) for start in range(0, elements, _CHUNK))
 
 
@@ -91,7 +92,7 @@ def volumes(quad: Quadrature, moved: Floats, change: Floats) -> Floats:
     (m, 4) array, mm^3/2: of the modes 1, x, y, z, orthonormal in the element.
     """
     out = np.empty((quad.size, 4))
-    for part in _chunks(quad.size):
+    for part in chunks(quad.size):
         gradient, _, inverse, det = _deform(quad, part, moved)
         local = change[quad.nodes[part]].transpose(0, 2, 1)
         slope = (local[:, None] @ gradient).transpose(0, 3, 1, 2)  # (n, q, b, a): of du_a along X_b
@@ -134,7 +135,7 @@ def forces(quad: Quadrature, moved: Floats, shear: Floats, bulk: Floats) -> tupl
         Where a volume is not positive.
     """
     out, energy = np.empty((quad.size, NODES, 3)), 0.0
-    for part in _chunks(quad.size):
+    for part in chunks(quad.size):
         at = points(quad, moved, shear[part], bulk[part], part)
         energy += float((quad.weight[part] * at.stored).sum())
         # first Piola-Kirchhoff stress, weighted
@@ -186,7 +187,7 @@ def linear_forces(quad: Quadrature, local: Floats, shear: Floats, bulk: Floats) 
     (m, 27, 3) array, mN.
     """
     out = np.empty_like(local)
-    for part in _chunks(quad.size):
+    for part in chunks(quad.size):
         inverse, weight, modes = quad.inverse[part], quad.weight[part], quad.modes[part]
         n, q = weight.shape
         slope = inverse @ (BY_REFERENCE @ local[part]).reshape(n, q, 3, 3)  # du_b / dx_a at [a, b]
@@ -206,7 +207,7 @@ def linear_forces(quad: Quadrature, local: Floats, shear: Floats, bulk: Floats) 
 def largest(quad: Quadrature, shear: Floats, bulk: Floats) -> float:
     """The largest entry of all elements' stiffness at rest, kPa mm: one of a diagonal, as it is definite."""
     found = 0.0
-    for part in _chunks(quad.size):
+    for part in chunks(quad.size):
         gradient, weight = quad.gradient(part), quad.weight[part]  # (n, 3, 27, q)
         square = (gradient**2 * (shear[part][:, None] * weight)[:, None, None]).sum(axis=3)
         change = gradient @ (weight[:, None] * quad.modes[part])[:, None].swapaxes(2, 3)
@@ -251,7 +252,7 @@ def stiffness(
         quad = quad.part(elements)
     out = np.empty((quad.size, DOFS, DOFS), dtype)
     still = np.zeros((int(quad.nodes.max()) + 1, 3)) if moved is None else moved
-    for part in _chunks(quad.size):
+    for part in chunks(quad.size):
         some = None if volume is None else volume[part]
         _stiffness(quad, part, still, shear[part], bulk[part], some, out[part])
     return out

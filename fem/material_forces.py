@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fem import elasticity
-from fem.quadrature import SHAPE, Quadrature
+from fem.quadrature import NODES, SHAPE, Quadrature
 
 Floats = NDArray[np.float64]
 
@@ -43,17 +43,20 @@ def material_forces(quad: Quadrature, place: Floats, moved: Floats, shear: Float
     Inverted
         Where a volume is not positive.
     """
-    at = elasticity.points(quad, moved, shear, bulk)
-    # the energy is p (J - 1) - p² / 2 kappa at the p for which its integral is largest: p need not change
-    excess = (at.det - 1) - at.pressure / bulk[:, None]
-    energy = at.stored + 0.5 * at.pressure * excess
-    momentum = energy[..., None, None] * np.eye(3) - at.f.swapaxes(2, 3) @ at.piola
-    momentum *= quad.weight[..., None, None]
-    found = np.einsum("mqab,mbiq->mia", momentum, at.gradient, optimize=True)
-    # the pressure's modes are linear in X, and move with the nodes
-    spread = np.einsum("mia,iq->mqa", place[quad.nodes], SHAPE)
-    spread -= spread.mean(axis=1, keepdims=True)
-    across = spread.swapaxes(1, 2)
-    slope = np.linalg.solve(across @ spread, across @ at.pressure[..., None])[..., 0]
-    found += ((quad.weight * excess) @ SHAPE.T)[..., None] * slope[:, None]
-    return np.asarray(found)
+    found = np.empty((quad.size, NODES, 3))
+    for part in elasticity.chunks(quad.size):
+        at = elasticity.points(quad, moved, shear[part], bulk[part], part)
+        weight = quad.weight[part]
+        # the energy is p (J - 1) - p² / 2 kappa at the p for which its integral is largest: p need not change
+        excess = (at.det - 1) - at.pressure / bulk[part][:, None]
+        energy = at.stored + 0.5 * at.pressure * excess
+        momentum = energy[..., None, None] * np.eye(3) - at.f.swapaxes(2, 3) @ at.piola
+        momentum *= weight[..., None, None]
+        found[part] = np.einsum("mqab,mbiq->mia", momentum, at.gradient, optimize=True)
+        # the pressure's modes are linear in X, and move with the nodes
+        spread = np.einsum("mia,iq->mqa", place[quad.nodes[part]], SHAPE)
+        spread -= spread.mean(axis=1, keepdims=True)
+        across = spread.swapaxes(1, 2)
+        slope = np.linalg.solve(across @ spread, across @ at.pressure[..., None])[..., 0]
+        found[part] += ((weight * excess) @ SHAPE.T)[..., None] * slope[:, None]
+    return found

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from fem import elasticity
+from fem import elasticity, heap
 from fem.meshed import Model
 from fem.quadrature import DOFS, NODES, Quadrature
 
@@ -82,6 +82,7 @@ class Tangent:
     @cached_property
     def stored(self) -> Stiffness:
         """All of them."""
+        heap.trim()  # beside the factor, these are what a press takes most memory for
         return Stiffness(self._made(None))
 
     def __call__(self, elements: Ints) -> NDArray[np.floating]:
