@@ -1,6 +1,7 @@
 """The emulator of the contact field: against solves it has not seen, by symmetry and scaling, as a file."""
 
 import io
+import json
 import time
 import zipfile
 from dataclasses import replace
@@ -19,7 +20,7 @@ from fem.emulator_limits import check
 from fem.ground import cubic
 from fem.regression import Regression, regress
 from fem.sampling import Plan, Ranges, background, geometry_at, solve
-from fem.solving import knots
+from fem.solving import claim, knots
 from fem.symmetry import unfold
 from fem.topology import Resolution
 
@@ -284,6 +285,17 @@ def test_builds_resume_and_keep_apart(emulator: Emulator, folder: Path) -> None:
         fit(PLAN, folder, 5)
     with pytest.raises(ValueError, match="samples, minutes: received neither"):
         build_emulator(PLAN, folder)
+
+
+def test_samples_of_other_mechanics_are_kept_apart(tmp_path: Path) -> None:
+    """A build that was begun before the mechanics changed does not go on as if nothing had."""
+    claim(PLAN, tmp_path)
+    claim(PLAN, tmp_path)
+    place = tmp_path / "plan.json"
+    head = json.loads(place.read_bytes())
+    place.write_text(json.dumps(head | {"format": head["format"] - 1}))
+    with pytest.raises(ValueError, match="or of another version"):
+        claim(PLAN, tmp_path)
 
 
 def test_file_gives_the_same_bytes_and_answers(emulator: Emulator, tmp_path: Path) -> None:
