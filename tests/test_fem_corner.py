@@ -61,17 +61,17 @@ def softest(body: Body, state: State) -> tuple[float, float]:
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 @pytest.mark.filterwarnings("ignore:Exited")
-@pytest.mark.parametrize("quality, levels", [("preview", range(1, 7)), ("standard", range(1, 5))])
-def test_a_sharp_corner_loses_its_stiffness(quality: str, levels: range) -> None:
+@pytest.mark.parametrize("quality, levels", [("preview", (1, 2, 3, 4, 5, 6)), ("standard", (1, 2, 3, 3.5))])
+def test_a_sharp_corner_loses_its_stiffness(quality: str, levels: tuple[float, ...]) -> None:
     """The smallest eigenvalue of the tangent over the stiffness at rest falls to nothing, sooner the finer
     the mesh, in a mode that lives at the corner; at standard quality no equilibrium is found at 6 mm."""
     geometry = Geometry(PROBE, SLAB, fem.Inclusion(10, 5, 100))
     with solver.one_thread():
         bare = path(geometry, build(geometry, mesh.QUALITIES[quality], True), False)
-        found = [softest(bare.body, bare.to(float(level))) for level in levels]
+        found = [softest(bare.body, bare.to(level)) for level in levels]
         for level, (stiffness, share) in zip(levels, found, strict=True):
             print(
-                f"{quality}, {level} mm: smallest stiffness {stiffness:.4f}, {share:.0%} of it at the corner"
+                f"{quality}, {level:g} mm: smallest stiffness {stiffness:.4f}, {share:.0%} of it at the corner"
             )
         stiffness = np.array([one for one, _ in found])
         assert (np.diff(stiffness) < 0).all() and stiffness[-1] < 0.1 * stiffness[0]

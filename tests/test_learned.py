@@ -76,13 +76,14 @@ def test_the_shipped_emulator_is_of_this_versions_plain_tissue(tissue):
 
 @pytest.mark.slow
 def test_light_beside_the_rim_follows_the_press_without_a_jump(variant: str) -> None:
-    """Of the same paths; at 2.93 mm the second node of the mesh passes the wall. It jumped by 8 % there."""
+    """At 2.93 mm the second node of the mesh passes the wall, where light jumped by 8 %. Steps of so many
+    paths are known to 0.3 %."""
     design, emulator = twin.load_design("tsis"), fem.load_emulator(learned.emulator_file("tsis"))
     renderer = SpectralRenderer(design.sensor(), count=1, at=design.sensor, device="cpu")
     found = []
     for depth in (2.88, 2.90, 2.92, 2.94, 2.96):
         press = presses.emulated(design, None, [depth], emulator)[0]
-        light = renderer.render(press.surface, quality="preview", samples=2**18, seed=1).traced
+        light = renderer.render(press.surface, quality="preview", samples=2**20, seed=1).traced
         assert light is not None
         rim = traced.blocks(light[0][:, 1].sum(axis=0), 100)
         found.append(np.mean([rim[25:75, 0], rim[25:75, -1], rim[0, 25:75], rim[-1, 25:75]]))
