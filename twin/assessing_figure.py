@@ -84,7 +84,17 @@ def _bars(
     mean = one.answers.mean[:, number]
     off = np.abs([one.answers.low[:, number], one.answers.high[:, number]] - mean)
     look = {"fmt": "o", "ms": 2.2, "color": colour, "ecolor": colour, "elinewidth": 0.5, "alpha": 0.6}
-    axis.errorbar(one.truth[:, number], mean - less, off, label=label, **look)
+    axis.errorbar(_aside(one.truth[:, number]), mean - less, off, label=label, **look)
+
+
+def _aside(truth: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Inclusions that are truly alike side by side, not one over the other."""
+    _, group, count = np.unique(truth, return_inverse=True, return_counts=True)
+    turn = np.empty(len(truth))
+    for number in range(len(count)):
+        rows = np.flatnonzero(group == number)
+        turn[rows] = np.arange(len(rows)) - 0.5 * (len(rows) - 1)
+    return np.asarray(truth + 0.012 * np.ptp(truth) * turn)
 
 
 def _widths(
@@ -120,7 +130,7 @@ def _ratios(axis: Axes, answered: Mapping[int, Answered]) -> None:
     """With the 90 % that errors of so few inclusions leave open, as if they were normal."""
     edges = np.array([LEAST_MM, 6.0, 8.0, 10.0, 13.0])
     middle, lines = 0.5 * (edges[:-1] + edges[1:]), list(itertools.product(answered, range(3)))
-    most = 1.5  # that is drawn: bars of one inclusion alone go far beyond
+    least, most = 0.5, 2.0
     for place, (frames, number) in enumerate(lines):
         one, colour = answered[frames], _COLOURS[list(answered).index(frames) % len(_COLOURS)]
         error, found = one.answers.mean[:, number] - one.truth[:, number], np.full((3, len(middle)), np.nan)
@@ -130,7 +140,8 @@ def _ratios(axis: Axes, answered: Mapping[int, Answered]) -> None:
                 ratio = np.sqrt(np.mean(error[rows] ** 2) / np.nanmean(one.limits[rows, number] ** 2))
                 ends = np.sqrt(count / stats.chi2.ppf([0.95, 0.05], count))
                 found[:, column] = ratio, *(ratio * ends)
-        most = max(most, 1.5 * float(np.nanmax(found[0], initial=0.0)))
+        least = min(least, float(np.nanmin(found[1:], initial=np.inf)))
+        most = max(most, float(np.nanmax(found[1:], initial=0.0)))
         aside = 0.22 * (place - 0.5 * (len(lines) - 1))
         off = np.abs(found[1:] - found[0])
         look = {"fmt": "osD"[number], "ms": 3.5, "color": colour, "elinewidth": 0.7}
@@ -143,8 +154,11 @@ def _ratios(axis: Axes, answered: Mapping[int, Answered]) -> None:
         ylabel="RMSE over the bound",
         title="how near the bound (bars: 90 %)",
         xlim=(edges[0], edges[-1]),
-        ylim=(0, most),
+        yscale="log",
+        ylim=(0.45 * least, 1.1 * most),  # the legend has the room below
     )
+    axis.yaxis.set_major_formatter("{x:g}")
+    axis.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.5)))
     axis.legend(frameon=False, fontsize=7, ncols=2, loc="lower center")
 
 
