@@ -70,9 +70,7 @@ def test_a_sharp_corner_loses_its_stiffness(quality: str, levels: tuple[float, .
         bare = path(geometry, build(geometry, mesh.QUALITIES[quality], True), False)
         found = [softest(bare.body, bare.to(level)) for level in levels]
         for level, (stiffness, share) in zip(levels, found, strict=True):
-            print(
-                f"{quality}, {level:g} mm: smallest stiffness {stiffness:.4f}, {share:.0%} at the corner"
-            )
+            print(f"{quality}, {level:g} mm: smallest stiffness {stiffness:.4f}, {share:.0%} at the corner")
         stiffness = np.array([one for one, _ in found])
         assert (np.diff(stiffness) < 0).all() and stiffness[-1] < 0.1 * stiffness[0]
         assert found[-1][1] > 0.7
