@@ -43,7 +43,7 @@ def emulator(variant: str, tmp_path_factory: pytest.TempPathFactory) -> fem.Emul
     ranges = Ranges(
         size_mm=(8.0, 12.0),
         depth_mm=(4.5, 6.5),
-        modulus_kPa=(30.0, 110.0),
+        modulus_kPa=(30.0, 130.0),
         offset_mm=1.5,
         indentation_mm=(0.5, 3.0),
         tissue_kPa=(4.5, 5.5),

@@ -37,8 +37,10 @@ def test_widths_are_those_of_the_closed_form(trained, frames):
     drawn = trained.sample(seen.astype(np.float32), frames, 800, 0)
     away = (drawn.mean(axis=1) - unit) / np.sqrt(np.diag(covariance))
     assert np.all(np.abs(np.sqrt((away**2).mean(axis=0)) - 1.0) < 0.3)
-    spread = np.sqrt(drawn.var(axis=1).mean(axis=0) / np.diag(covariance))
-    assert np.all(np.abs(spread - 1.0) < 0.3)
+    # of what intervals are made; a variance is that of the flow's far tails, after so short a training
+    low, high = np.percentile(drawn, [15.87, 84.13], axis=1)
+    spread = 0.5 * np.sqrt(((high - low) ** 2).mean(axis=0) / np.diag(covariance))
+    assert np.all(np.abs(spread - 1.0) < 0.15)
 
 
 @pytest.mark.slow
