@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.ticker import LogFormatter
+from matplotlib.ticker import LogFormatter, NullLocator
 from numpy.typing import NDArray
 from scipy import stats
 
@@ -157,8 +157,9 @@ def _ratios(axis: Axes, answered: Mapping[int, Answered]) -> None:
         yscale="log",
         ylim=(0.45 * least, 1.1 * most),  # the legend has the room below
     )
+    axis.set_yticks([tick for tick in 2.0 ** np.arange(-4, 8) if 0.45 * least < tick < 1.1 * most])
     axis.yaxis.set_major_formatter("{x:g}")
-    axis.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.5)))
+    axis.yaxis.set_minor_locator(NullLocator())
     axis.legend(frameon=False, fontsize=7, ncols=2, loc="lower center")
 
 
