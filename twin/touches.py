@@ -176,8 +176,8 @@ def _solved(design: Design, ball: fem.Inclusion, level: float, unknowns: Sequenc
 
 def _are_spheres(design: Design, ball: fem.Inclusion, steps: dict[str, float]) -> bool:
     """Whether multipoles press the inclusion, and all that it is changed to: their mesh stays, and slopes of
-    the pressure are right to half a per cent, where a mesh that follows the inclusion is 4 % off in size and
-    10 % in offset."""
+    the pressure are right to 2 %, where on a mesh that follows the inclusion they are 4 % off in size and 9 %
+    in offset."""
     own = [name for name in steps if knows_inclusion(name)]
     ends = [{name: value_of(design, ball, name) + k * steps[name]} for name in own for k in (-2, -1, 1, 2)]
     for changes in [{}, *ends]:
