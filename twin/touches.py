@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 import fem
-from fem import spheres
 from scenes.surface import OpticalSurface, resample
 from twin import forward, presses
 from twin.complaint import DesignError, shown
@@ -82,9 +81,8 @@ def touch(
     ----------
     position : of the sensor, mm, minus the design's; the specimen is taken to go on beside it, so that only
         the inclusion's offset changes.
-    emulator : of the design's mechanics; without, solved on a coarse mesh at small strain, where fields are
-        in proportion to the depth: spheres by multipoles in plain tissue (`fem.multipoles`), what these do
-        not model on a mesh around it (`fem.press`, "linear").
+    emulator : of the design's mechanics; without, solved on a coarse mesh at small strain (`fem.press`,
+        "preview" and "linear"), where fields are in proportion to the depth.
 
     Raises
     ------
@@ -137,17 +135,23 @@ def _slope(
 
 
 def _solved(design: Design, ball: fem.Inclusion, level: float, unknowns: Sequence[Unknown]) -> Touch:
-    """At 1 mm, then in proportion; a centred inclusion shares its symmetry."""
+    """At 1 mm, then in proportion; moduli share a mesh, and a centred inclusion its symmetry."""
     presses.check(design, ball, [level])
-    steps = {u.name: forward.step_of(u, value_of(design, ball, u.name)) for u in unknowns}
-    by_multipoles = _are_spheres(design, ball, steps)
 
     def fields(changes: dict[str, float]) -> tuple[Floats, Floats]:
         there, inclusion, _ = _changed(design, ball, changes)
         there.check_inclusion(inclusion)
-        return _both(design, there, _press(there, inclusion, by_multipoles).surface)
+        return _both(design, there, _press(there, inclusion).surface)
 
-    middle = fields({})
+    steps = {u.name: forward.step_of(u, value_of(design, ball, u.name)) for u in unknowns}
+    moduli = [ball.modulus]
+    if "modulus_kPa" in steps:
+        moduli += [ball.modulus - steps["modulus_kPa"], ball.modulus + steps["modulus_kPa"]]
+    bodies = design.probe(), design.slab(), ball
+    same = {"mechanics": "linear", "quality": "preview", "estimate": False}
+    several = fem.press_moduli(*bodies, moduli, 1.0, **same)  # type: ignore[arg-type]
+    at_moduli = [_both(design, design, _tied(one[0]).surface) for one in several]
+    middle = at_moduli[0]
     square = ball.offset == (0.0, 0.0)
     found: dict[str, NDArray[np.float32]] = {}
     for unknown in unknowns:
@@ -155,6 +159,8 @@ def _solved(design: Design, ball: fem.Inclusion, level: float, unknowns: Sequenc
         value, step = value_of(design, ball, name), steps[name]
         if name in _SKIN:
             found[name] = _skin(unknown, value, middle)
+        elif name == "modulus_kPa":
+            found[name] = _difference(at_moduli[2], at_moduli[1], step)
         elif name == DEPTH:
             found[name] = np.stack(middle).astype(np.float32)
         elif square and name == "offset_y_mm" and "offset_x_mm" in found:
@@ -166,29 +172,12 @@ def _solved(design: Design, ball: fem.Inclusion, level: float, unknowns: Sequenc
             found[name] = _slope(fields, unknown, value, step, middle)
     for name in found:
         if knows_inclusion(name):
-            # a mesh that follows the inclusion takes the error of the background along: what the inclusion
-            # adds is the difference of two presses on one mesh
+            # the mesh follows the inclusion, and the error of the background with it: what the inclusion adds
+            # is the difference of two presses on one mesh
             found[name][0] -= found[name][1]
             found[name][1] = 0.0
     scaled = {name: (level * slope).astype(np.float32) for name, slope in found.items()}
     return Touch(level * middle[0], level * middle[1], scaled, steps)
-
-
-def _are_spheres(design: Design, ball: fem.Inclusion, steps: dict[str, float]) -> bool:
-    """Whether multipoles press the inclusion, and all that it is changed to: their mesh stays, and slopes of
-    the pressure are right to 2 %, where on a mesh that follows the inclusion they are 4 % off in size and 9 %
-    in offset."""
-    own = [name for name in steps if knows_inclusion(name)]
-    ends = [{name: value_of(design, ball, name) + k * steps[name]} for name in own for k in (-2, -1, 1, 2)]
-    for changes in [{}, *ends]:
-        try:
-            changed = _changed(design, ball, changes)[1]
-            spheres.refuse(design.probe(), design.slab(), changed, design.pose())
-        except fem.NotModelled:
-            return False
-        except ValueError:  # it does not fit: no slope is taken there
-            continue
-    return True
 
 
 def value_of(design: Design, ball: fem.Inclusion, name: str) -> float:
@@ -204,10 +193,7 @@ def value_of(design: Design, ball: fem.Inclusion, name: str) -> float:
     return found
 
 
-def _press(design: Design, ball: fem.Inclusion, by_multipoles: bool) -> fem.Press | fem.Emulated:
-    """By 1 mm."""
-    if by_multipoles:
-        return presses.expanded(design, ball, [1.0], quality="preview")[0]
+def _press(design: Design, ball: fem.Inclusion) -> Any:
     bodies = design.probe(), design.slab(), ball
     return _tied(fem.press(*bodies, 1.0, mechanics="linear", quality="preview", estimate=False))
 
