@@ -10,7 +10,6 @@ own error, drawn anew for every picture: at a fixed truth the covariance that no
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -81,9 +80,9 @@ def two_in_air() -> twin.Design:
     return replace(design, leds=design.leds[:2], camera=camera)
 
 
-def rough(columns: int = 192, rows: int = 123) -> twin.Design:
-    """Skin of thrice the slope."""
-    design = small(columns, rows)
+def rough() -> twin.Design:
+    """Skin of thrice the slope, seen by fewer pixels."""
+    design = small(128, 82)
     return replace(design, surface=replace(design.surface, rms_slope=3 * design.surface.rms_slope))
 
 
@@ -94,8 +93,9 @@ def spread(
     emulator: fem.Emulator,
     ball: fem.Inclusion = BALL,
     level: float = 2.0,
+    count: int = COUNT,
 ) -> dict[str, Any]:
-    """Bounds, and the estimators' errors in them, (COUNT, p)."""
+    """Bounds, and the estimators' errors in them, (count, p)."""
     first, expansion, at = expand(design, ball, unknowns, emulator, level)
     told = forward.information(first, unknowns, design, frames=frames)
     least = bound(told)
@@ -104,10 +104,10 @@ def spread(
     pictures = []
     for number, noise in enumerate(noises):
         rows = with_pattern(design.camera, noise, expansion.rows(number))
-        taken = photograph(design, expansion.mean[number], noise.frames, COUNT, rng)
+        taken = photograph(design, expansion.mean[number], noise.frames, count, rng)
         pictures.append((taken, rows, noise))
     known = np.array([unknown.sd for unknown in unknowns])
-    drawn = known * rng.standard_normal((COUNT, len(known))) * (known < 1e2)
+    drawn = known * rng.standard_normal((count, len(known))) * (known < 1e2)
     found, last = fit(pictures, expansion, told.prior, drawn)
     offset = {0: least.sd[0], 1: -least.sd[1], 2: least.sd[2]}
     bent = expansion.amounts(np.array([[offset.get(i, 0.0) for i in range(len(known))]]))[0]
@@ -133,7 +133,7 @@ def judge(found: dict[str, Any], label: str) -> None:
     assert found["last"] < 0.02
     assert found["off"] < 0.03
     assert np.abs(ratio[:3] - 1.0).max() < 0.15
-    assert ratio.min() > 1.0 - 3.5 / np.sqrt(2 * COUNT)  # never significantly below, nuisances too
+    assert ratio.min() > 1.0 - 3.5 / np.sqrt(2 * len(error))  # never significantly below, nuisances too
 
 
 @pytest.mark.slow
@@ -162,23 +162,17 @@ def test_maximum_likelihood_reaches_the_bound(
     [
         ("a faint inclusion, with the prior", small),
         ("the same, rough skin", rough),
-        pytest.param(
-            "the same, rough skin, fewer pixels",
-            partial(rough, 128, 82),
-            marks=pytest.mark.xfail(
-                strict=True,
-                raises=AssertionError,
-                reason="1.17 bounds, a third of one beside the truth, with 12 bits, too: why is not known",
-            ),
-        ),
         ("the same, two LEDs, 12 bits", two_in_air),
     ],
 )
 def test_the_maximum_of_the_posterior_reaches_the_bound_with_prior(
     label: str, made: Any, emulator: fem.Emulator
 ) -> None:
-    """A faint inclusion, coarse pixels, a light press, one frame: pictures alone leave log E at over 0.2."""
-    found = spread(made(), 1, BOXED + NUISANCES, emulator, FAINT, 1.0)
+    """A faint inclusion, coarse pixels, a light press, one frame: pictures alone leave log E at over 0.2.
+
+    The maximum is beside the truth by a fifth of the bound there, and of 240 pictures by up to a third.
+    """
+    found = spread(made(), 1, BOXED + NUISANCES, emulator, FAINT, 1.0, 4 * COUNT)
     assert found["sd"][2] > 0.2
     judge(found, label)
 
