@@ -233,7 +233,12 @@ class Multipoles:
 
 
 def multipoles(
-    probe: Probe, slab: Slab, quality: str = "standard", centred: bool = False, pose: Pose = STRAIGHT
+    probe: Probe,
+    slab: Slab,
+    quality: str = "standard",
+    centred: bool = False,
+    pose: Pose = STRAIGHT,
+    degree: int | None = None,
 ) -> Multipoles:
     """Solve plain tissue under a flat probe that presses straight down on the slab's middle.
 
@@ -245,6 +250,8 @@ def multipoles(
         For inclusions below the probe's middle alone: a quarter of the unknowns.
     pose
         To be refused if it is another.
+    degree
+        Of the last multipoles, 1 or more, by default the quality's.
 
     Raises
     ------
@@ -270,7 +277,7 @@ def multipoles(
         return Multipoles(
             probe,
             slab,
-            fineness.degree,
+            degree or fineness.degree,
             rate,
             -(reaction @ own).reshape(model.nodes.tip.shape),
             model,

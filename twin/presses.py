@@ -43,8 +43,11 @@ MIN_FORCE_N = 1e-4
 # carries at small strain at the deepest press is it out of reach without a look.
 _SURELY_TOO_MUCH = 2.0
 
-
 _OWN = 0.7  # share of the time that a press takes without its background
+
+# Samples of a corpus follow each other in the same tissue, off the middle 1.3 GiB of it; a layout's slopes
+# ask for six, coarse, of every inclusion.
+_FINE, _COARSE = (lru_cache(maxsize=size)(fem.multipoles) for size in (2, 8))
 
 
 def levels_of(
@@ -222,9 +225,14 @@ def expanded(
     *,
     by_force: bool = False,
     quality: Quality = "standard",
+    degree: int | None = None,
 ) -> list[Emulated]:
     """Return the presses at small strain by multipoles in tissue that is solved once (`fem.multipoles`), on
     the background of `solved`.
+
+    Parameters
+    ----------
+    degree : of the last multipoles, by default the quality's.
 
     Raises
     ------
@@ -234,7 +242,10 @@ def expanded(
     check_expanded(design, inclusion, quality)
     centred = inclusion is None or not any(inclusion.offset)
     with _in_designs_words():
-        found = _tissue(design.probe(), design.slab(), quality, centred).press(inclusion, levels, by_force)
+        tissue = (_COARSE if quality == "preview" else _FINE)(
+            design.probe(), design.slab(), quality, centred, degree=degree
+        )
+        found = tissue.press(inclusion, levels, by_force)
     if by_force:
         _check_depth(design, found, levels)
     return spheres_on_background(found, design.probe(), design.slab(), QUALITIES[quality])
@@ -247,11 +258,6 @@ def check_expanded(design: Design, inclusion: fem.Inclusion | None, quality: Qua
         raise DesignError("quality", f"{quality!r} with multipoles", allowed)
     with _in_designs_words():
         spheres.refuse(design.probe(), design.slab(), inclusion, design.pose())
-
-
-@lru_cache(maxsize=2)  # samples of a corpus follow each other in the same tissue
-def _tissue(probe: fem.Probe, slab: fem.Slab, quality: str, centred: bool) -> fem.Multipoles:
-    return fem.multipoles(probe, slab, quality, centred)
 
 
 @contextmanager
