@@ -18,7 +18,7 @@ import numpy as np
 import pyvista as pv
 from numpy.typing import NDArray
 
-from fem.emulator import Emulated
+from fem.emulated import Emulated
 from fem.equilibrium import NotConverged
 from fem.ground import bare_geometry, carry, ground, lines
 from fem.mesh import Geometry

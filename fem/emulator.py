@@ -18,13 +18,15 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from fem import surface
+from fem.emulated import Emulated
 from fem.emulator_errors import Errors
 from fem.emulator_limits import check, within
 from fem.ground import cubic
+from fem.lines import lines, lines_of
 from fem.mesh import Geometry
 from fem.model import Inclusion, Probe, Slab
 from fem.regression import Regression
-from fem.sampling import CLEARANCE, Plan, contrast, lines, lines_of
+from fem.sampling import CLEARANCE, Plan, contrast
 from fem.solving import knots
 from fem.symmetry import Image, images, unfold
 from fem.topology import Resolution
@@ -35,38 +37,6 @@ Floats = NDArray[np.float64]
 CENTRED = [0, 1, 4, 5, 6, 7]
 """The inputs that are no offsets: all that the gain from a finer mesh depends on, in the mesh's coordinates;
 the last one at finite strain only."""
-
-
-@dataclass(frozen=True)
-class Emulated:
-    """Answer of an emulator; fields as those of `fem.Press`, which it can stand in for where no cut is drawn.
-
-    Attributes
-    ----------
-    surface
-        The contact surface with `displacement`, `pressure`, `area` and, without inclusion, `displacement_0`,
-        `pressure_0`, `area_0`.
-    error_percent
-        95th percentile of what held-out solves of inclusions of this kind (`Errors.alike`: of 4 mm and more,
-        or not; or nearest in size) were off by: largest error of the tared displacement off the probe's
-        edge, in per cent of its maximum. None where too few were held out to tell.
-    dof
-        Unknowns of plain tissue, where spheres in it are multipoles (`fem.Multipoles`, whose answers these
-        are, too).
-    """
-
-    surface: pv.PolyData
-    indentation_mm: float
-    indentation_0_mm: float
-    force_N: float
-    force_0_N: float
-    min_pressure_kPa: float
-    seconds: float
-    mechanics: str
-    error_percent: float | None
-    path: str = "emulated"
-    background: str = "shared"
-    dof: int | None = None
 
 
 @dataclass(frozen=True)

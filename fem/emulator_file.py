@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from fem.emulator import Emulator
 from fem.emulator_errors import Errors
+from fem.lines import logical_lines
 from fem.regression import Regression, groups
-from fem.sampling import PLAN, Plan, logical_lines
+from fem.sampling import PLAN, Plan
 from fem.solving import KNOTS
 
 Floats = NDArray[np.float64]

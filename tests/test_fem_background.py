@@ -10,7 +10,7 @@ import pytest
 import fem
 from fem import background
 from fem.ground import bare_geometry, fine
-from fem.sampling import lines
+from fem.lines import lines
 from twin import load_design
 from twin.exposure import mechanics_facts
 

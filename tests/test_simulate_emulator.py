@@ -14,7 +14,7 @@ import twin
 from fem.emulator import Emulator
 from fem.emulator_errors import Errors
 from fem.regression import Regression
-from fem.sampling import lines, logical_lines
+from fem.lines import lines, logical_lines
 from fem.solving import KNOTS
 from fem.topology import Resolution
 from twin import presses

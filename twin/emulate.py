@@ -73,7 +73,7 @@ def plan_of(design: Design, seed: int = 0) -> Plan:
         ranges=ranges,
         mechanics=design.mechanics,
         seed=seed,
-    )
+    ).by_multipoles()
 
 
 def emulate(
