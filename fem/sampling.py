@@ -36,18 +36,17 @@ from pydantic.dataclasses import dataclass
 from scipy.stats import qmc
 
 from fem import mesh
-from fem.contact_fields import contact_of
-from fem.equilibrium import State
 from fem.ground import bare_geometry, cubic, ground
 from fem.ground import lines as grid_lines
 from fem.lines import lines, logical_lines
 from fem.mesh import Geometry
 from fem.meshed import build
 from fem.model import Inclusion, Length, Poisson, Probe, Slab, check
-from fem.path import Path, path
+from fem.path import path
 from fem.ripples import expanded, without_ripples
 from fem.solver import one_thread
 from fem.spheres import refuse
+from fem.tared import tared
 from fem.topology import Resolution
 
 Floats = NDArray[np.float64]
@@ -270,7 +269,7 @@ def solve(plan: Plan, point: Floats) -> dict[str, Floats]:
     with one_thread():
         model = build(geometries[0], plan.resolution, False)
         bare = path(geometries[0], model, False)
-        found = [_tared(g, path(g, model, True, bare), bare, 1.0) for g in geometries]
+        found = [tared(g, path(g, model, True, bare), bare, 1.0) for g in geometries]
     return {name: np.stack([f[k] for f in found]) for k, name in enumerate(("rise", "moved"))}
 
 
@@ -309,11 +308,11 @@ def stretch(plan: Plan, point: Floats) -> dict[str, Floats]:
     with one_thread():
         model = build(geometry, res, False)
         bare = path(geometry, model, False)
-        small = _tared(geometry, path(geometry, model, True, bare), bare, 1.0)
+        small = tared(geometry, path(geometry, model, True, bare), bare, 1.0)
         model = build(geometry, res, True)
         bare = path(geometry, model, False)
         full = path(geometry, model, True, bare)
-        found = [_tared(geometry, full, bare, float(level)) for level in plan.levels[1:]]
+        found = [tared(geometry, full, bare, float(level)) for level in plan.levels[1:]]
     whole, true = [np.stack([f[k] for f in found]) for k in range(2)], small
     if plan.degree:
         smooth = _expanded(plan, point, np.array([ratio]), res)
@@ -365,12 +364,6 @@ def _gain(
     return {name: gain(name) for name in ("rise", "moved")}
 
 
-def _tared(geometry: Geometry, full: Path, bare: Path, level: float) -> tuple[Floats, Floats]:
-    """Rise (n, n) and tared displacement (n, n, 3) per mm of the level, mm."""
-    pressure, moved, pressure_0, moved_0 = _fields(geometry, (full.to(level), bare.to(level)))
-    return (pressure - pressure_0) / pressure_0, (moved - moved_0) / level
-
-
 def background(plan: Plan, thickness: float, tissue: float) -> dict[str, Floats]:
     """Press on plain tissue, on the grid that answers are given on.
 
@@ -393,16 +386,3 @@ def background(plan: Plan, thickness: float, tissue: float) -> dict[str, Floats]
     )
     shape = (len(found), x.size, x.size)
     return {"x": x, "pressure": pressure.reshape(shape) / tissue, "moved": moved.reshape(*shape, 3)}
-
-
-def _fields(geometry: Geometry, states: tuple[State, State]) -> tuple[Floats, Floats, Floats, Floats]:
-    """Pressure (n, n) and displacement (n, n, 3) on the whole footprint, of both states; kPa, mm."""
-    contact, _ = contact_of(geometry, states)
-    n = round(contact.n_points**0.5)
-    data = contact.point_data
-    return (
-        np.asarray(data["pressure"], dtype=float).reshape(n, n),
-        np.asarray(data["displacement"], dtype=float).reshape(n, n, 3),
-        np.asarray(data["pressure_0"], dtype=float).reshape(n, n),
-        np.asarray(data["displacement_0"], dtype=float).reshape(n, n, 3),
-    )

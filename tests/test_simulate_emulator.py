@@ -13,8 +13,8 @@ import fem
 import twin
 from fem.emulator import Emulator
 from fem.emulator_errors import Errors
-from fem.regression import Regression
 from fem.lines import lines, logical_lines
+from fem.regression import Regression
 from fem.solving import KNOTS
 from fem.topology import Resolution
 from twin import presses
