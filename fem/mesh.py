@@ -22,8 +22,8 @@ Floats = NDArray[np.float64]
 # Largest error of tared maximum and total against 145 thousand unknowns, over (size, depth, modulus) =
 # (10, 5, 100), (4, 6, 60), (13, 4, 120), (8, 5, 60), 1 mm of small strain: preview 2.3 %, standard 0.4 %,
 # reference 0.2 % (`make bench` prints the table). Shells outside the sphere and cells along its arc matter
-# most for these; cells towards the probe's edge for the displacement there. Tared *pressure* is 1.3 to 1.8 % too
-# high at its maximum at all three (`pytest -m slow -s tests/test_fem_ripples.py -k nearer`).
+# most for these; cells towards the probe's edge for the displacement there. Tared *pressure* is 1.3 to 1.8 %
+# too high at its maximum at all three (`pytest -m slow -s tests/test_fem_ripples.py -k nearer`).
 QUALITIES = {
     "preview": Resolution(
         arc=3, core=1, shell=3, above=2, below=1, edge=2, side=2, layer=1, backing=1, growth=(2.0, 1.6)

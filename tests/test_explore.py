@@ -81,6 +81,18 @@ def prepared(tmp_path: Path, method: str = "latin", name: str = "out", **more: A
     return explore.prepare(file, tmp_path / name, **more)
 
 
+def test_inclusions_whose_bounds_are_of_a_mesh_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where presses are solved: those too shallow for multipoles, or too far beside the middle."""
+    ball = "[[inclusions]]\nsize_mm = 9.0\ndepth_mm = {}\nmodulus_kPa = 80.0\noffset_x_mm = {}\n"
+    more = ball.format(2.5, 0.0) + ball.format(6.0, 3.0) + ball.format(6.0, 7.0)
+    monkeypatch.setattr("test_explore.STUDY", STUDY + more)
+    found = replace(prepared(tmp_path), emulator=None)
+    (line,) = explore_words.findings(found)
+    assert line.startswith("inclusions 1, 3: pressed on meshes that follow them")
+
+
 def records(folder: Path) -> list[dict[str, Any]]:
     found = [explored.read(place) for place in sorted((folder / "trials").iterdir())]
     return [one for one in found if one is not None]

@@ -142,7 +142,7 @@ def _solved(design: Design, ball: fem.Inclusion, level: float, unknowns: Sequenc
     """At 1 mm, then in proportion; a centred inclusion shares its symmetry."""
     presses.check(design, ball, [level])
     steps = {u.name: forward.step_of(u, value_of(design, ball, u.name)) for u in unknowns}
-    by_multipoles = _are_spheres(design, ball, steps)
+    by_multipoles = mesh_stays(design, ball, steps)
 
     def fields(changes: dict[str, float]) -> tuple[Floats, Floats]:
         there, inclusion, _ = _changed(design, ball, changes)
@@ -176,10 +176,10 @@ def _solved(design: Design, ball: fem.Inclusion, level: float, unknowns: Sequenc
     return Touch(level * middle[0], level * middle[1], scaled, steps)
 
 
-def _are_spheres(design: Design, ball: fem.Inclusion, steps: dict[str, float]) -> bool:
-    """Whether multipoles press the inclusion, and all that it is changed to: their mesh stays. One that
-    follows the inclusion leaves ripples in the pressure, 4 % of what its size changes, that tell size from
-    modulus better than the press does."""
+def mesh_stays(design: Design, ball: fem.Inclusion, steps: dict[str, float]) -> bool:
+    """Whether a solved inclusion, and all that it is changed to (``steps`` by unknown), is pressed by
+    multipoles, whose mesh stays. One that follows the inclusion leaves ripples in the pressure, 4 % of what
+    its size changes, that tell size from modulus better than the press does."""
     own = [name for name in steps if knows_inclusion(name)]
     ends = [{name: value_of(design, ball, name) + k * steps[name]} for name in own for k in (-2, -1, 1, 2)]
     for changes in [{}, *ends]:
