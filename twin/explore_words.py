@@ -28,10 +28,10 @@ def findings(exploration: Exploration) -> list[str]:
         )
     followed = _followed(exploration) if exploration.emulator is None else []
     if followed:
+        which = ", ".join(map(str, followed))
         lines.append(
-            f"inclusions {', '.join(map(str, followed))}: pressed on meshes that follow them, whose ripples "
-            "pass for knowledge: their bounds are too low by a third and more (EXPLORE.md says what multipoles "
-            "press)"
+            f"inclusions {which}: pressed on meshes that follow them, whose ripples pass for knowledge: their "
+            "bounds are too low by a third and more (EXPLORE.md says what multipoles press)"
         )
     return lines
 
