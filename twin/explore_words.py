@@ -30,8 +30,8 @@ def findings(exploration: Exploration) -> list[str]:
     if followed:
         which = ", ".join(map(str, followed))
         lines.append(
-            f"inclusions {which}: pressed on meshes that follow them, whose ripples pass for knowledge: their "
-            "bounds are too low by a third and more (EXPLORE.md says what multipoles press)"
+            f"inclusions {which}: pressed on meshes that follow them, whose ripples pass for knowledge: "
+            "their bounds are too low by a third and more (EXPLORE.md says what multipoles press)"
         )
     return lines
 
