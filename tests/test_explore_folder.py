@@ -110,10 +110,10 @@ def test_an_emulator_that_came_since_is_not_taken(tmp_path: Path, monkeypatch: p
 
 
 def test_folders_without_hashes_go_on(tmp_path: Path) -> None:
-    """As they were made before: three words in explore.json."""
+    """Those that say no more than whose they are and how they were judged."""
     found = prepared(tmp_path)
     head = json.loads((found.folder / explore.HEAD).read_text())
-    old = {name: head[name] for name in ("storage", "trials", "emulator")}
+    old = {name: head[name] for name in ("storage", "trials", "emulator", "judged")}
     (found.folder / explore.HEAD).write_text(json.dumps(old))
     assert explore.reopened(found.folder) == found
     assert prepared(tmp_path) == found
@@ -231,12 +231,22 @@ def test_a_folder_with_luminaires_may_be_moved(tmp_path: Path) -> None:
         explore.prepare(there / "mine.toml", there / "out")
 
 
-def test_layouts_judged_in_other_light_are_not_gone_on_with(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("version", ["LIGHT", "SIGHT", "JUDGED"])
+def test_layouts_judged_otherwise_are_not_gone_on_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, version: str
 ) -> None:
     prepared(tmp_path)
-    monkeypatch.setattr(explore_folder, "LIGHT", explore_folder.LIGHT + 1)
-    with pytest.raises(DesignError, match=r"--out: .*another version of the light"):
+    monkeypatch.setattr(explore_folder, version, getattr(explore_folder, version) + 1)
+    with pytest.raises(DesignError, match=r"--out: .*judged by another version"):
+        prepared(tmp_path)
+
+
+def test_layouts_judged_before_that_was_said_are_not_gone_on_with(tmp_path: Path) -> None:
+    found = prepared(tmp_path)
+    head = json.loads((found.folder / explore.HEAD).read_text())
+    del head["judged"]
+    (found.folder / explore.HEAD).write_text(json.dumps(head))
+    with pytest.raises(DesignError, match=r"--out: .*judged by another version"):
         prepared(tmp_path)
 
 

@@ -194,7 +194,7 @@ class Work:
         known = None if self.emulator is None else (self.emulator.plan, float(self.emulator.pressure.sum()))
         felt = design.effective_modulus_kPa, design.surface.rms_slope, design.surface.kappa
         bodies = design.probe(), design.slab(), inclusion, design.mechanics if known else "linear"
-        return what, 1, bodies, felt, known, level, place, self.moving
+        return what, 2, bodies, felt, known, level, place, self.moving
 
     def _light_key(
         self, what: str, inclusion: fem.Inclusion, level: float, place: tuple[float, float]

@@ -29,6 +29,10 @@ STUDY, BASE, HEAD, DATABASE = "study.toml", "base.toml", "explore.json", "study.
 TRIALS, BASELINE, KEPT, WORKERS = "trials", "baseline", "kept", "workers"
 LOCK = "storage.lock"
 
+JUDGED = 2
+"""Version of how layouts are judged beside their light; 2: a mesh and a row of pixels no longer tell of an
+inclusion (`twin.touches`, `scenes.tangent`)."""
+
 _SECRETS = (
     (re.compile(r"(?<=://)([^:/]*):.*@"), r"\1:***@"),
     (re.compile(r"(?i)(?<=[?&])(pass\w*)=[^&]*"), r"\1=***"),
@@ -46,6 +50,8 @@ class Head:
     luminaires: tuple[str | None, ...] | None = None
     light: tuple[int, int] | None = None
     """Versions of the light that layouts are judged in: `scenes.traced.LIGHT`, `scenes.view.SIGHT`."""
+    judged: int = 1
+    """`JUDGED`; folders of before 2 do not say it."""
 
 
 _HEAD = TypeAdapter(Head)
@@ -55,9 +61,8 @@ def head_of(design: Design, storage: str | None, trials: int, emulator: Path | N
     """What a folder is to say of an exploration."""
     told = None if emulator is None else _sha256(emulator)
     lamps = tuple(None if led.ies is None else ies.digest(led.ies) for led in design.leds)
-    return Head(
-        storage, trials, None if emulator is None else str(emulator.resolve()), told, lamps, (LIGHT, SIGHT)
-    )
+    place = None if emulator is None else str(emulator.resolve())
+    return Head(storage, trials, place, told, lamps, (LIGHT, SIGHT), JUDGED)
 
 
 def earlier(folder: Path, text: str) -> Head | None:
@@ -108,8 +113,8 @@ def check_same(folder: Path, before: Head, now: Head, design: Design) -> None:
             received = f"{shown(str(folder))}, the folder of another sensor"
             allowed = f"a new folder, or {field} = {shown(old.get(field))} as there"
             raise DesignError("--out", f"{received} ({field} is now {shown(new.get(field))})", allowed)
-    if before.light not in (None, now.light):
-        received = f"{shown(str(folder))}, whose layouts were judged by another version of the light"
+    if before.light not in (None, now.light) or before.judged != now.judged:
+        received = f"{shown(str(folder))}, whose layouts were judged by another version"
         raise DesignError("--out", received, "a new folder")
     known = before.emulator_sha256
     if known is None and before.emulator is not None:
