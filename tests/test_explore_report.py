@@ -1,7 +1,7 @@
 """The page of a layout study: what it picks, what it escapes, and that a browser shows it without network."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -118,6 +118,24 @@ def test_importance_finds_what_was_turned(study: Path) -> None:
         assert sum(one.share.values()) == pytest.approx(1.0)
         if one.objective == "led_power_W":
             assert max(one.share, key=lambda name: one.share[name]) == "leds.*.flux_W"
+
+
+def test_importance_is_that_of_a_choice_with_one_good_value(study: Path) -> None:
+    """On a grid: all but the first of four sheets gain nine, whatever the slope, which gives up to one."""
+    results = read(study)
+    grid = [(sheet, slope) for sheet in (0.0, 0.05, 0.1, 0.3) for slope in (0.3, 0.8, 2.0, 6.0)]
+    trials = tuple(
+        replace(
+            results.trials[0],
+            values={"layout.sheet_mm": sheet, "surface.rms_slope": slope},
+            objectives={"bound_modulus_kPa": (9.0 if sheet == 0.0 else 0.0) + 0.1 * slope},
+        )
+        for sheet, slope in grid
+    )
+    objectives = {"bound_modulus_kPa": "minimize"}
+    (found,) = importances(replace(results, trials=trials, objectives=objectives))
+    assert list(found.share) == ["layout.sheet_mm", "surface.rms_slope"]
+    assert found.share["layout.sheet_mm"] > 0.5
 
 
 def test_least_size_in_closed_form() -> None:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import re
 import tomllib
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -226,89 +225,37 @@ def winners(losses: Floats, along: Sequence[int], most: int = 3) -> tuple[int, .
 
 
 def importances(results: Results) -> list[Importance]:
-    """Return what each field did to each objective: Optuna's word, or rank correlations where it has none."""
+    """Return what each field alone did to each objective, as shares of what all of them did."""
     fields = results.fields()
     if len(results.trials) < _FEWEST or not fields:
         return []
-    found = []
-    for name in results.objectives:
-        asked = _by_optuna(results, name)
-        found.append(asked or _by_rank(results, fields, name))
-    return found
+    return [_importance(results, fields, name) for name in results.objectives]
 
 
-def _by_optuna(results: Results, objective: str) -> Importance | None:
-    """Variance explained (fANOVA) after the study's own database; None where Optuna cannot."""
-    try:
-        import optuna
-    except ImportError:
-        return None
-    trials = [trial for trial in results.trials if np.isfinite(trial.objectives.get(objective, np.nan))]
-    try:
-        optuna.logging.set_verbosity(optuna.logging.WARNING)
-        study = optuna.create_study(direction=results.objectives[objective])
-        spread = _distributions(trials)
-        for trial in trials:
-            study.add_trial(
-                optuna.trial.create_trial(
-                    params=trial.values, distributions=spread, value=trial.objectives[objective]
-                )
-            )
-        try:
-            judge: Any = optuna.importance.FanovaImportanceEvaluator(seed=0)
-            way = "fANOVA"
-        except ImportError:  # without scikit-learn
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-                judge, way = optuna.importance.PedAnovaImportanceEvaluator(), "PED-ANOVA"
-        share = optuna.importance.get_param_importances(study, evaluator=judge)
-    except (ImportError, ValueError, RuntimeError, KeyError):
-        return None
-    total = sum(share.values())
-    if not total > 0:
-        return None
-    return Importance(
-        objective, {name: value / total for name, value in share.items()}, f"{way} ({len(trials)} trials)"
-    )
-
-
-def _distributions(trials: Sequence[Trial]) -> dict[str, Any]:
-    """The spans that were tried."""
-    import optuna
-
-    found: dict[str, Any] = {}
-    for name in trials[0].values:
-        values = [trial.values[name] for trial in trials]
-        numbers = [value for value in values if isinstance(value, int | float)]
-        if len(numbers) < len(values) or len(set(values)) < 2:
-            choices = tuple(dict.fromkeys(sorted(values, key=str)))
-            found[name] = optuna.distributions.CategoricalDistribution(choices)
-        elif all(isinstance(value, int) for value in values):
-            found[name] = optuna.distributions.IntDistribution(int(min(numbers)), int(max(numbers)))
-        else:
-            found[name] = optuna.distributions.FloatDistribution(float(min(numbers)), float(max(numbers)))
-    return found
-
-
-def _by_rank(results: Results, fields: Sequence[str], objective: str) -> Importance:
-    """Squared rank correlation; of choices the share of variance between them (correlation ratio)."""
+def _importance(results: Results, fields: Sequence[str], objective: str) -> Importance:
+    """Share of the variance of ranks that lies between a field's values (correlation ratio, less what chance
+    gives so many groups: Kelley 1935, [kelley1935]); of numbers that hardly repeat, squared rank correlation.
+    """
     target = loss(results.trials, {objective: "minimize"})[:, 0]
     known = np.isfinite(target)
     rank = rankdata(target[known])
     share = {}
     for name in fields:
         values = [trial.values.get(name) for trial, keep in zip(results.trials, known, strict=True) if keep]
-        if all(isinstance(value, int | float) for value in values):
-            other = rankdata(np.array(values, np.float64))
-            flat = np.ptp(other) == 0 or np.ptp(rank) == 0
-            share[name] = 0.0 if flat else float(np.corrcoef(other, rank)[0, 1] ** 2)
+        distinct = list(dict.fromkeys(values))
+        numbers = all(isinstance(value, int | float) for value in values)
+        if len(distinct) < 2 or np.ptp(rank) == 0:
+            share[name] = 0.0
+        elif numbers and 2 * len(distinct) > len(values):
+            share[name] = float(np.corrcoef(rankdata(np.array(values, np.float64)), rank)[0, 1] ** 2)
         else:
-            groups = [rank[[value == one for value in values]] for one in dict.fromkeys(values)]
-            between = sum(len(group) * (group.mean() - rank.mean()) ** 2 for group in groups)
-            share[name] = float(between / max(((rank - rank.mean()) ** 2).sum(), 1e-12))
+            groups = [rank[[value == one for value in values]] for one in distinct]
+            within = sum(float(((group - group.mean()) ** 2).sum()) for group in groups)
+            within /= max(len(rank) - len(groups), 1)
+            share[name] = max(0.0, 1.0 - within / float(rank.var(ddof=1)))
     total = sum(share.values()) or 1.0
     ordered = dict(sorted(((name, value / total) for name, value in share.items()), key=lambda x: -x[1]))
-    return Importance(objective, ordered, f"squared rank correlation ({int(known.sum())} trials)")
+    return Importance(objective, ordered, f"variance of ranks ({int(known.sum())} trials)")
 
 
 def _given(tables: Any, path: Sequence[str]) -> Value | None:
