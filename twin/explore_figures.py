@@ -29,18 +29,20 @@ def layouts(
     noises: Sequence[Noise],
     extent_mm: Sequence[tuple[float, float]],
     presses: Sequence[tuple[int, float]],
+    full: Sequence[float],
 ) -> Figure:
     """Draw each layout's picture, its tared picture and what a step of d, h and E does, over the noise.
 
     ``noises`` is of one true pixel of each layout, ``extent_mm`` width and height that its pictures show,
-    ``presses`` the number and the depth (mm) of the press that is shown.
+    ``presses`` the number and the depth (mm) of the press that is shown, ``full`` the camera's largest count:
+    pictures are shown in per cent of it, so that cameras of other bits look alike.
     """
     rows = len(trials)
     figure = Figure(figsize=(10.4, 1.75 * rows + 0.45), facecolor="white", layout="constrained")
     figure.get_layout_engine().set(w_pad=0.02, h_pad=0.03)
     axes: Any = figure.subplots(rows, 5, squeeze=False)
     held = []
-    for trial, noise, (press, _) in zip(trials, noises, presses, strict=True):
+    for trial, noise, (press, _), top in zip(trials, noises, presses, full, strict=True):
         counts, slopes = trial.pictures()
         at = 2 * press  # its reference follows
         mean = _grey(counts, 3)[at : at + 2]
@@ -48,7 +50,7 @@ def layouts(
         maps = {
             name: UNITS[name][2] * _grey(slopes[name], 3)[at] * weight for name in UNITS if name in slopes
         }
-        held.append((mean, maps))
+        held.append((100.0 * mean / top, maps))
     ends = {
         name: max(
             (float(np.quantile(np.abs(maps[name]), 0.999)) for _, maps in held if name in maps), default=1
@@ -80,7 +82,7 @@ def layouts(
         axes[row, 0].set_ylabel(label, fontsize=10, color=COLOURS[row % len(COLOURS)], fontweight="bold")
         for column in range(len(drawn), 5):
             axes[row, column].set_visible(False)
-    heads = ["picture, counts", "tared, counts"]
+    heads = ["picture, % of range", "tared, % of range"]
     heads += [f"{UNITS[name][0]} + {UNITS[name][1].replace('mm', '1 mm')}, σ a pixel" for name in held[0][1]]
     for axis, head in zip(axes[0], heads, strict=False):
         axis.set_title(head, fontsize=9.5, color=INK)

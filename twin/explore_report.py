@@ -114,10 +114,11 @@ def _best(made: Page, results: Results, shown: Sequence[Trial]) -> None:
     trials = [one for one, _ in held]
     noises = [noise_of(design, _frames(one)) for one, design in held]
     extent = [(design.camera.field_of_view_mm, design.camera.field_height_mm) for _, design in held]
+    full = [2.0**design.camera.bits - 1.0 for _, design in held]
     ball = figures.inclusion_label(trials[0].told["inclusions"][0]).replace("\n", ", ")
     depth = _levels(shown[0])[0]
     made.figure(
-        figures.layouts(trials, noises, extent, [_press(one, depth) for one in trials]),
+        figures.layouts(trials, noises, extent, [_press(one, depth) for one in trials], full),
         f"The press nearest to {depth:g} mm on the first inclusion ({ball}; mm and kPa). Right: what "
         "one more mm of d and of h and 10 kPa of E add to each pixel, in standard deviations of its noise as "
         "the protocol averages it; the same scale in each column.",
