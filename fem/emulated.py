@@ -36,4 +36,5 @@ class Emulated:
     error_percent: float | None
     path: str = "emulated"
     background: str = "shared"
+    signal: str = "smooth"  # or "meshed"; as of `fem.Press`
     dof: int | None = None

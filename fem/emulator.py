@@ -125,6 +125,7 @@ class Emulator:
             time.perf_counter() - start,
             self.plan.mechanics,
             self.errors.percentile("displacement", 95, size) if inclusion else 0.0,
+            signal="smooth" if self.plan.degree else "meshed",
         )
 
     def _depth(

@@ -200,6 +200,17 @@ class Path:
             self._linear = path(self.geometry, model, self.body.stiff, beside)
         return self._linear
 
+    def per_mm(self) -> State:
+        """Equilibrium of a linear press of 1 mm with all pairs closed, on the undeformed mesh; cheap when
+        `rate` is."""
+        first = self.states[0]
+        model = replace(first.model, finite=False)
+        rate = self.rate()
+        forces = model.nodal(product(self.body.rest, rate, model))
+        nodes, closed = model.nodes, np.ones(first.closed.shape, dtype=bool)
+        chest = -forces[nodes.chest].sum(axis=0)
+        return State(1.0, rate, closed, -forces[nodes.tip, 2], chest, model, first.tie)
+
     def rate(self) -> Floats:
         """Displacements per mm of a linear press with all pairs closed, (nodes, 3) mm / mm.
 

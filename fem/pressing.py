@@ -21,6 +21,7 @@ from fem.meshed import build, moduli
 from fem.model import Inclusion, NotConverged, NotModelled, Pose, Probe, Slab, check
 from fem.path import path
 from fem.solver import one_thread
+from fem.tared import tared_at_rest
 from fem.topology import Layout, Resolution, materials, probe_topology, slab_topology
 from fem.trust import discretisation_error
 
@@ -69,6 +70,9 @@ class Press:
     background
         Plain tissue on the surface: "own", of the press's own mesh with its ripples, or "shared" by all
         inclusions (`fem.on_background`).
+    signal
+        What the inclusion adds: "meshed", with the ripples of its mesh, a per cent or two of the tared
+        pressure's maximum, or "smooth", without them (`fem.on_background`).
     """
 
     surface: pv.PolyData
@@ -86,7 +90,11 @@ class Press:
     error_percent: float
     _states: tuple[State, State] = field(repr=False)
     _geometry: Geometry = field(repr=False)
+    _small: tuple[Floats, Floats] | None = field(
+        default=None, repr=False
+    )  # `tared_at_rest`, of closed contact
     background: str = "own"
+    signal: str = "meshed"
 
     def inclusion(self) -> tuple[Floats, Floats] | None:
         """The deformed inclusion as an ellipsoid, centre (3,) and axes (3, 3) in mm; see `fem.carried`."""
@@ -315,11 +323,13 @@ def _presses(
             bare = path(first, model, False)
             step("without inclusion")
             paths = [bare if g.inclusion is None else path(g, model, True, bare) for g in geometries]
-            if estimate or bare.states[0].closed.all():
+            flat = bool(bare.states[0].closed.all())
+            if estimate or flat:
                 for one in (bare, *paths):
                     one.rate()
             for geometry, full in zip(geometries, paths, strict=True):
                 error = discretisation_error(geometry, res, full, bare) if estimate else np.nan
+                small = tared_at_rest(geometry, full, bare) if flat and geometry.inclusion else None
                 step("error estimate")
                 found: dict[float, Press] = {}
                 for level in sorted(set(levels)):
@@ -328,7 +338,7 @@ def _presses(
                         for p in (full, bare)
                     )
                     seconds = time.perf_counter() - start
-                    found[level] = _press(geometry, states, mechanics, res, error, seconds)  # type: ignore[arg-type]
+                    found[level] = _press(geometry, states, small, mechanics, res, error, seconds)  # type: ignore[arg-type]
                     step(f"level {level:g}")
                 yield [found[level] for level in levels]
             tell("done", 1.0)
@@ -347,6 +357,7 @@ def _materials(geometry: Geometry, layout: Layout) -> NDArray[np.int64]:
 def _press(
     geometry: Geometry,
     states: tuple[State, State],
+    small: tuple[Floats, Floats] | None,
     mechanics: Mechanics,
     res: Resolution,
     error: float,
@@ -382,4 +393,5 @@ def _press(
         error_percent=error,
         _states=states,
         _geometry=geometry,
+        _small=small,
     )

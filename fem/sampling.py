@@ -43,10 +43,10 @@ from fem.mesh import Geometry
 from fem.meshed import build
 from fem.model import Inclusion, Length, Poisson, Probe, Slab, check
 from fem.path import path
-from fem.ripples import expanded, without_ripples
+from fem.ripples import DEGREE, expanded, without_ripples
 from fem.solver import one_thread
 from fem.spheres import refuse
-from fem.tared import tared
+from fem.tared import tared, tared_at_rest
 from fem.topology import Resolution
 
 Floats = NDArray[np.float64]
@@ -57,7 +57,6 @@ _BEYOND = 0.03  # by how much of a range the samples reach beyond it: at the end
 _OFFSETS = (1, 1), (0, 0), (1, 0), (0, 0)  # which of its offsets each point of four keeps
 CLEARANCE = 4.0
 """Least distance between inclusion and chest wall, mm."""
-_DEGREE = 8  # of multipoles: tared maxima are converged to 0.03 %
 _RAREST = 4096  # of so many specimens drawn one fits at least, or there are none to be had
 
 LEAN = Resolution(arc=3, core=1, shell=3, above=3, below=1, edge=2, side=3, layer=1, backing=1)
@@ -232,7 +231,7 @@ class Plan:
             refuse(self.probe, slab, worst)
         except ValueError:
             return self
-        return replace(self, degree=_DEGREE, resolution=STORED)
+        return replace(self, degree=DEGREE, resolution=STORED)
 
     def point(self, number: int) -> Floats:
         return next(islice(self.points(), number, None))
@@ -269,7 +268,7 @@ def solve(plan: Plan, point: Floats) -> dict[str, Floats]:
     with one_thread():
         model = build(geometries[0], plan.resolution, False)
         bare = path(geometries[0], model, False)
-        found = [tared(g, path(g, model, True, bare), bare, 1.0) for g in geometries]
+        found = [tared_at_rest(g, path(g, model, True, bare), bare) for g in geometries]
     return {name: np.stack([f[k] for f in found]) for k, name in enumerate(("rise", "moved"))}
 
 
@@ -306,13 +305,11 @@ def stretch(plan: Plan, point: Floats) -> dict[str, Floats]:
     ratio = (1 + 1.5 * point[6]) / (1 - point[6])
     geometry, res = geometry_at(plan, point, float(ratio * point[5])), plan.coarse
     with one_thread():
-        model = build(geometry, res, False)
-        bare = path(geometry, model, False)
-        small = tared(geometry, path(geometry, model, True, bare), bare, 1.0)
         model = build(geometry, res, True)
         bare = path(geometry, model, False)
         full = path(geometry, model, True, bare)
-        found = [tared(geometry, full, bare, float(level)) for level in plan.levels[1:]]
+        small = tared_at_rest(geometry, full, bare)
+        found = [tared(geometry, (full.to(level), bare.to(level))) for level in plan.levels[1:].tolist()]
     whole, true = [np.stack([f[k] for f in found]) for k in range(2)], small
     if plan.degree:
         smooth = _expanded(plan, point, np.array([ratio]), res)

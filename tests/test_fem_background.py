@@ -11,11 +11,14 @@ import fem
 from fem import background
 from fem.ground import bare_geometry, fine
 from fem.lines import lines
+from fem.mesh import QUALITIES
+from fem.ripples import DEGREE
 from twin import load_design
 from twin.exposure import mechanics_facts
 
 PROBE = fem.Probe(25, (fem.Layer(2, 27), fem.Layer(3, 61), fem.Layer(5, 156)))
 SLAB = fem.Slab(30, 60, 5)
+ZERO = np.zeros(1)
 LARGE, SMALL = fem.Inclusion(12, 4, 100), fem.Inclusion(4, 5, 60)
 
 
@@ -57,10 +60,11 @@ def test_plain_tissue_is_the_same_under_all_inclusions(large: fem.Press, small: 
     np.testing.assert_allclose(np.unique(np.round(shared[0].surface.points[:, 0], 6)), expected, atol=1e-6)
 
 
-@pytest.mark.parametrize("which", ["large", "small"])
-def test_what_the_inclusion_does_stays(which: str, request: pytest.FixtureRequest) -> None:
-    own = request.getfixturevalue(which)
+@pytest.mark.parametrize("sphere", [LARGE, SMALL])
+def test_what_an_ellipsoid_does_stays(sphere: fem.Inclusion) -> None:
+    own = pressed(replace(sphere, stretch=(1.0, 1.0, 0.99)))
     (shared,) = fem.on_background([own])
+    assert (shared.background, shared.signal) == ("shared", "meshed")
     before, after = (fem.scalars(one.surface, 2.0)["tared"] for one in (own, shared))
     assert after["max_mm"] == pytest.approx(before["max_mm"], rel=2e-3)
     assert after["total_mm3"] == pytest.approx(before["total_mm3"], rel=0.02)
@@ -70,6 +74,40 @@ def test_what_the_inclusion_does_stays(which: str, request: pytest.FixtureReques
     assert (shared.force_N, shared.path) == (own.force_N, own.path)
     facts = [mechanics_facts(load_design("tsis"), one) for one in (own, shared)]
     assert [told["background"] for told in facts] == ["own", "shared"]
+    assert [told["signal"] for told in facts] == ["meshed", "meshed"]
+
+
+@pytest.mark.parametrize("by", ["indentation", "force"])
+@pytest.mark.parametrize("offset", [(0.0, 0.0), (2.0, 0.0)])
+def test_a_sphere_does_what_its_multipoles_do(by: str, offset: tuple[float, float]) -> None:
+    """At small strain; its mesh is up to two per cent beside that."""
+    ball, level = replace(LARGE, offset=offset), 1.0 if by == "indentation" else 3.0
+    how = {"mechanics": "linear", "quality": "preview", "estimate": False}
+    (own,) = fem.press(PROBE, SLAB, ball, **{by: [level]}, **how)  # type: ignore[call-overload]
+    (shared,) = fem.on_background([own])
+    assert mechanics_facts(load_design("tsis"), shared)["signal"] == "smooth"
+    tissue = fem.multipoles(PROBE, SLAB, "preview", centred=(not offset[0], True), degree=DEGREE)
+    spheres = tissue.press(ball, [own.indentation_mm])
+    (other,) = background.spheres_on_background(spheres, PROBE, SLAB, QUALITIES["preview"])
+    depths = own.indentation_0_mm / own.indentation_mm  # of the background, other than 1 by force
+    scale = {"pressure_0": depths, "displacement_0": depths}
+    for name in ("pressure_0", "displacement_0", "pressure", "displacement"):
+        expected = scale.get(name, 1.0) * np.asarray(other.surface[name])
+        top = np.abs(expected).max()
+        np.testing.assert_allclose(shared.surface[name], expected, rtol=0, atol=1e-4 * top)
+    meshed, smooth = (fem.scalars(one.surface, 2.0)["tared"]["max_mm"] for one in (own, shared))
+    assert abs(meshed / smooth - 1) > 5e-3
+
+
+def test_finite_strain_keeps_what_it_adds(small: fem.Press) -> None:
+    """Over small strain, at the middle, as on the sphere's own mesh."""
+    (finite,) = fem.press(PROBE, SLAB, SMALL, [1.0], quality="preview", estimate=False)
+    times = []
+    for pair in ((finite, small), [fem.on_background([one])[0] for one in (finite, small)]):
+        rise = [along(one, "pressure", ZERO) / along(one, "pressure_0", ZERO) - 1 for one in pair]
+        times.append(float((rise[0] / rise[1])[0]))
+    assert times[0] > 1.01
+    assert times[1] == pytest.approx(times[0], rel=2e-3)
 
 
 def test_plain_tissue_is_its_own_background() -> None:

@@ -103,6 +103,7 @@ def mechanics_facts(design: Design, press: Press | Emulated) -> dict[str, Any]:
         "min_pressure_kPa": press.min_pressure_kPa,
         "path": press.path,
         "background": press.background,
+        "signal": press.signal,
         "mechanics": "emulator" if emulated else press.mechanics,
         **({"emulated": press.mechanics} if emulated else {}),
         "error_percent": _known(press.error_percent),

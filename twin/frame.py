@@ -75,9 +75,9 @@ class Frame:
     emulator, which knows the contact surface only."""
     fem: dict[str, Any] = field(default_factory=dict)
     """Scalars ``raw`` and ``tared`` of the surface, ``min_pressure_kPa``, ``path``, ``background``,
-    ``mechanics``, ``error_percent``, ``dof`` and ``seconds``, as `fem.Press` explains them. From an emulator,
-    ``mechanics`` is "emulator", ``emulated`` what it learned ("finite" or "linear"), ``dof`` None, and
-    ``error_percent`` (`fem.Emulated`) None where it cannot tell."""
+    ``signal``, ``mechanics``, ``error_percent``, ``dof`` and ``seconds``, as `fem.Press` explains them. From
+    an emulator, ``mechanics`` is "emulator", ``emulated`` what it learned ("finite" or "linear"), ``dof``
+    None, and ``error_percent`` (`fem.Emulated`) None where it cannot tell."""
     tsis: dict[str, Any] = field(default_factory=dict)
     """Scalars ``raw`` and ``tared`` of the picture, ``saturated_percent``, ``frames`` and
     ``reference_frames`` (exposures that picture and reference are the mean of), ``seconds``,
