@@ -91,7 +91,7 @@ def _beside_ideal(
     truth: NDArray[np.float64],
     deflection: NDArray[np.float64],
 ) -> list[dict[str, Any]]:
-    """Areas under the curve of the network and of an ideal observer, by size and depth."""
+    """Areas under the curve of the model and of an ideal observer, by size and depth."""
     empty, full = presence[blank], presence[~blank]
     if not len(empty):
         return []

@@ -138,10 +138,8 @@ class Estimator:
         )
 
     def presence(self, seen: Single, frames: float, start: NDArray[np.floating]) -> float:
-        """Return the probability of an inclusion, for coarse counts (levels, 2, r, c): the network's, or that
-        of `presence.presence` by a fit from a start (5,), where the model is calibrated."""
-        if self.calibration is None:
-            return float(self.network.present(self.features(seen[None]), frames)[0])
+        """Return the probability of an inclusion, for coarse counts (levels, 2, r, c), by a fit from a start
+        (5,); see `presence.presence`."""
         sight, fitted = self.sight, self.fitted(seen, frames, start)
         off = sight.error + sight.off(fitted.pictures)
         return presence(self.chain, sight.features, self.prior, sight.told(seen), frames, fitted, off)

@@ -87,8 +87,12 @@ _SCRIPT = """\
     });
     put(svg, 'text', {x: box.left + box.wide / 2, y: box.top + box.high + 38, 'text-anchor': 'middle'},
       data.words[x.value]);
-    put(svg, 'text', {transform: 'translate(14 ' + (box.top + box.high / 2) + ') rotate(-90)',
-      'text-anchor': 'middle'}, data.words[y.value]);
+    var label = put(svg, 'text', {transform: 'translate(14 ' + (box.top + box.high / 2) + ') rotate(-90)',
+      'text-anchor': 'middle'}, data.words[y.value]), room = box.high + 2 * box.top;
+    if (label.getComputedTextLength() > room) {
+      label.setAttribute('textLength', room);
+      label.setAttribute('lengthAdjust', 'spacingAndGlyphs');
+    }
     var taken = [];
     var order = data.trials.slice().sort(function (a, b) { return a.rank - b.rank; });
     order.forEach(function (trial) {
