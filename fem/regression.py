@@ -18,7 +18,7 @@ from scipy.optimize import minimize
 
 Floats = NDArray[np.float64]
 
-_MODES = 80  # at most
+_MODES = 160  # at most; with half of them, specimens under the probe's middle are twice as far off
 _TINY = 1e-9  # share of the variance that may be left out
 _GROUPS = (0, 1, 2, 4, 8, 16)  # first modes of groups that share their lengths
 _LEADING = 16  # modes of a group that the lengths are found from
@@ -94,7 +94,8 @@ def principal(fields: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     left, size, modes = np.linalg.svd(fields - mean, full_matrices=False)
     total = (size**2).sum() or 1.0  # fields that are all the same have none
     left_out = 1 - np.cumsum(size**2) / total
-    k = min(_MODES, int(np.searchsorted(-left_out, -_TINY)) + 1, max(1, len(fields) - 8))
+    enough = int(np.searchsorted(-left_out, -_TINY)) + 1 if size.any() else 1
+    k = min(_MODES, enough, max(1, len(fields) - 8))
     root = np.sqrt(len(fields))
     return mean, modes[:k] * size[:k, None] / root, left[:, :k] * root, size[:k] / (size[:k].sum() or 1.0)
 

@@ -24,7 +24,7 @@ _STYLE = f"""\
 .front svg {{ width: {_WIDTH}px; max-width: 100%; height: auto; }}
 .front .side {{ flex: 1 1 320px; min-width: 300px; font-size: .88rem; }}
 #front select {{ font: inherit; font-size: .88rem; width: 23rem; }}
-#front label {{ font-size: .88rem; margin-right: .8rem; color: #555; }}
+#front label {{ font-size: .88rem; margin-right: .8rem; color: #555; display: inline-block; }}
 .front circle {{ cursor: pointer; }}
 .front circle:focus-visible {{ outline: 2px solid {INK}; outline-offset: 2px; }}
 .front h3 {{ margin: 0 0 .3rem; font-size: 1rem; }}
