@@ -7,7 +7,7 @@ taken from the press's own mesh, plain tissue from `fem.ground`, and pictures of
 differ by the inclusions alone.
 
 What is left in the ratio are ripples of a per cent or two of what the inclusion adds. Of spheres in the reach
-of multipoles these are taken out, too (`fem.ripples`).
+of multipoles these can be taken out, too (`fem.ripples`).
 """
 
 from __future__ import annotations
@@ -40,22 +40,26 @@ _OWN_MESH = (
 )
 
 
-def on_background(presses: Sequence[Press]) -> list[Press]:
+def on_background(presses: Sequence[Press], smooth: bool = False) -> list[Press]:
     """Return presses of one specimen, one for each level, with surfaces that stand on the common background.
 
     `displacement` and `pressure` of the surface become those of plain tissue on the common mesh, the former
-    plus what the inclusion adds, the latter times what it multiplies it by; it has that mesh's nodes. What
-    spheres within the reach of multipoles add is without the ripples of their mesh. All
+    plus what the inclusion adds, the latter times what it multiplies it by; it has that mesh's nodes. All
     else, forces too, stays that of the press's own mesh. Where contact has opened anywhere, as it does under
     domes and most tilted probes, presses are returned as they are; and, with a warning, where plain tissue
     cannot be followed as deep on the common mesh. `Press.background` and `Press.signal` tell which.
+
+    Parameters
+    ----------
+    smooth
+        Take the ripples of its mesh out of what a sphere within the reach of multipoles adds.
     """
     if not presses or not all(one.path != "unilateral" and one.min_pressure_kPa > 0 for one in presses):
         return list(presses)
     first = presses[0]
     own, res = first._geometry, first._states[0].model.layout.res
     geometry = bare_geometry(own.probe, own.slab, own.pose)
-    smooth = _within_reach(own)
+    smooth = smooth and _within_reach(own)
     try:
         found = _on_ground(presses, geometry, res, first.mechanics == "finite", smooth)
         return [replace(one, signal="smooth") for one in found] if smooth else found

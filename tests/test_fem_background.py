@@ -65,7 +65,7 @@ def test_plain_tissue_is_the_same_under_all_inclusions(large: fem.Press, small: 
 @pytest.mark.parametrize("sphere", [LARGE, SMALL])
 def test_what_an_ellipsoid_does_stays(sphere: fem.Inclusion) -> None:
     own = pressed(replace(sphere, stretch=(1.0, 1.0, 0.99)))
-    (shared,) = fem.on_background([own])
+    (shared,) = fem.on_background([own], smooth=True)
     assert (shared.background, shared.signal) == ("shared", "meshed")
     before, after = (fem.scalars(one.surface, 2.0)["tared"] for one in (own, shared))
     assert after["max_mm"] == pytest.approx(before["max_mm"], rel=2e-3)
@@ -86,7 +86,7 @@ def test_a_sphere_does_what_its_multipoles_do(by: str, offset: tuple[float, floa
     ball, level = replace(LARGE, offset=offset), 1.0 if by == "indentation" else 3.0
     how = {"mechanics": "linear", "quality": "preview", "estimate": False}
     (own,) = fem.press(PROBE, SLAB, ball, **{by: [level]}, **how)  # type: ignore[call-overload]
-    (shared,) = fem.on_background([own])
+    (shared,) = fem.on_background([own], smooth=True)
     assert mechanics_facts(load_design("tsis"), shared)["signal"] == "smooth"
     tissue = fem.multipoles(PROBE, SLAB, "preview", centred=(not offset[0], True), degree=DEGREE)
     spheres = tissue.press(ball, [own.indentation_mm])
@@ -105,7 +105,7 @@ def test_finite_strain_keeps_what_it_adds(small: fem.Press) -> None:
     """Over small strain, at the middle, as on the sphere's own mesh."""
     (finite,) = fem.press(PROBE, SLAB, SMALL, [1.0], quality="preview", estimate=False)
     times = []
-    for pair in ((finite, small), [fem.on_background([one])[0] for one in (finite, small)]):
+    for pair in ((finite, small), [fem.on_background([one], smooth=True)[0] for one in (finite, small)]):
         rise = [along(one, "pressure", ZERO) / along(one, "pressure_0", ZERO) - 1 for one in pair]
         times.append(float((rise[0] / rise[1])[0]))
     assert times[0] > 1.01
@@ -146,7 +146,7 @@ def test_standard_quality_is_reference_quality_to_pictures() -> None:
     for quality in ("standard", "reference"):
         own = fem.press(PROBE, SLAB, ball, levels, quality=quality, estimate=False)
         both = []
-        for presses in (own, fem.on_background(own)):
+        for presses in (own, fem.on_background(own, smooth=True)):
             assert presses[0].signal == ("meshed" if presses is own else "smooth")
             surfaces = [one.surface for one in presses]
             rises = [added(s, 1.0, 1.0)[0] for s in surfaces]

@@ -10,9 +10,13 @@ import pytest
 from numpy.typing import NDArray
 
 import fem
+from fem import mesh
 from fem.ground import carry, lines
 from fem.harmonics import Harmonic, harmonics, regular, singular
+from fem.ripples import DEGREE, expanded
+from fem.spheres import QUALITIES, Fineness
 from fem.spherical import Field, answer, answering, displacements, fields, gradients, tractions
+from fem.topology import Resolution
 
 Floats = NDArray[np.float64]
 
@@ -215,9 +219,7 @@ def test_against_a_refined_mesh(
     """The table of `fem.spheres.QUALITIES`: tared maximum and total, 1 mm, d >= 8 mm."""
     from test_fem_convergence import REFINED
 
-    from fem.mesh import QUALITIES
-
-    monkeypatch.setitem(QUALITIES, "refined", REFINED)
+    monkeypatch.setitem(mesh.QUALITIES, "refined", REFINED)
     made = fem.multipoles(PROBE, SLAB, quality, centred=True)
     for size, depth, modulus in ((10, 5, 100), (12, 7, 40), (8, 6, 110), (13, 4, 120), (4, 6, 60)):
         ball = fem.Inclusion(size, depth, modulus)
@@ -230,3 +232,26 @@ def test_against_a_refined_mesh(
         assert abs(maximum) < limits[0]
         if size >= 8:
             assert abs(total) < limits[1]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_plain_tissue_is_fine_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What spheres add to the pressure within 10 mm of the middle, against the finest tissue, eight degrees,
+    over its maximum."""
+    at, found = np.linspace(-10.0, 10.0, 41), {}
+    finest = Fineness(Resolution(8, 0, 4, 4, 4, 8, 5, 2, 1), 4)
+    for name, fineness in (("finest", finest), *QUALITIES.items()):
+        monkeypatch.setitem(QUALITIES, name, fineness)
+        found[name] = np.stack(
+            [
+                expanded(PROBE, SLAB, fem.Inclusion(*ball), [ball[2]], DEGREE, (at, at), name)[0][0]
+                for ball in ((10.0, 5.0, 100.0), (6.0, 4.5, 60.0), (13.0, 4.0, 120.0), (8.0, 8.0, 80.0))
+            ]
+        )
+    top = found["finest"].max(axis=(1, 2))
+    for name, limits in (("preview", (0.5, 1.5)), ("standard", (0.15, 0.5))):
+        off = found[name] - found["finest"]
+        rms, most = 100 * np.sqrt((off**2).mean(axis=(1, 2))) / top, 100 * np.abs(off).max(axis=(1, 2)) / top
+        print(f"\n{name}: {rms.round(2)} % rms, {most.round(2)} % at most")
+        assert (rms < limits[0]).all() and (most < limits[1]).all()

@@ -3,8 +3,8 @@
 A network that is trained to tell misses faint ones, and is sure of nonsense where references are a little
 off. Here both cases are fitted with all that is unknown, and what the chain is off by is in the noise, in
 both as much as with the inclusion that is found; where neither fit is explained by that, it is taken for
-louder, so that the better one is. Evidences are Laplace's (MacKay 2003, section 28.1; [mackay2003]), odds before are
-even.
+louder, so that the better one is. Evidences are Laplace's (MacKay 2003, section 28.1; [mackay2003]), odds
+before are even.
 """
 
 from __future__ import annotations

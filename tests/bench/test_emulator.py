@@ -116,7 +116,7 @@ def missed_by(built: Emulator, point: np.ndarray, quality: str) -> list[float]:
         quality=quality,
         estimate=False,
     )
-    for level, press in zip(levels, fem.on_background(presses), strict=True):
+    for level, press in zip(levels, fem.on_background(presses, smooth=built.plan.degree > 0), strict=True):
         onto = [cubic(line, built.x) for line in lines(press.surface)]
         true = onto[0] @ _tared(press) @ onto[1].T
         miss = _tared(built(plan.probe, geometry.slab, geometry.inclusion, level)) - true
