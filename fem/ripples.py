@@ -49,8 +49,7 @@ def expanded(
     NotModelled, ValueError
         For what multipoles do not press, in one line.
     """
-    centred = ball.offset[0] == 0.0, ball.offset[1] == 0.0
-    tissue = multipoles(probe, slab, quality, centred, degree=degree)
+    tissue = multipoles(probe, slab, quality, degree=degree)
     rises, moves, shape = [], [], (to[0].size, to[1].size)
     for (one,) in tissue.press_moduli(ball, moduli, [1.0]):
         own, (rise, moved) = lines_of(one.surface), added(one.surface, 1.0, 1.0)

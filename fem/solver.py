@@ -192,25 +192,24 @@ class Factor:
         """
         # a power of two, so that scaling is exact and single precision neither over- nor underflows
         scale = 2.0 ** np.frexp(np.abs(load).max(axis=0))[1]
-        columns = np.atleast_2d((load / scale).T)
-        x = np.zeros((len(columns), self.tree.size + 1), _KIND[self.precision])
-        x[:, self.tree.order] = columns
+        columns = (load / scale).reshape(len(load), -1)
+        x = np.zeros((self.tree.size + 1, columns.shape[1]), _KIND[self.precision])
+        x[self.tree.order] = columns
         steps = list(zip(self.tree.batches, self._panels, strict=True))
-
-        def times(panels: Array, rows: NDArray[np.int32]) -> Array:
-            return panels @ np.ascontiguousarray(x[:, rows].transpose(1, 2, 0))
-
         with one_thread():
             for batch, panels in steps:
-                pivots, below = batch.rows[:, : batch.width], batch.rows[:, batch.width :].ravel()
-                for column, part in zip(x, times(panels, pivots).transpose(2, 0, 1), strict=True):
-                    column[pivots] = part[:, : batch.width]
-                    np.add.at(column, below, part[:, batch.width :].ravel())
+                pivots, below = batch.rows[:, : batch.width], batch.rows[:, batch.width :]
+                part = panels @ x[pivots]
+                x[pivots] = part[:, : batch.width]
+                rest = part[:, batch.width :]
+                if x.shape[1] == 1:
+                    np.add.at(x[:, 0], below.ravel(), rest.ravel())
+                else:  # rows of one front are not the same
+                    for rows, more in zip(below, rest, strict=True):
+                        x[rows] += more
             for batch, panels in reversed(steps):
-                found = times(panels.transpose(0, 2, 1), batch.rows)
-                x[:, batch.rows[:, : batch.width]] = found.transpose(2, 0, 1)
-        unknowns = x[:, self.tree.order].astype(np.float64)
-        return (unknowns.T if load.ndim > 1 else unknowns[0]) * scale
+                x[batch.rows[:, : batch.width]] = panels.transpose(0, 2, 1) @ x[batch.rows]
+        return np.asarray(x[self.tree.order].reshape(load.shape) * scale, dtype=np.float64)
 
 
 def apply(tree: Tree, matrices: Matrices, x: Floats) -> Floats:

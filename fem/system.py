@@ -37,9 +37,14 @@ class Nodes:
     centres: Floats  # logical middles of the elements, the probe hung on the slab, (m, 3)
 
 
+Parity = tuple[bool, bool]
+"""Whether fields are odd about the symmetry planes across x and y: the negative of their mirror images."""
+EVEN: Parity = (False, False)
+
+
 @lru_cache(maxsize=16)
-def nodes(layout: Layout, sides: str) -> Nodes:
-    """Find the nodes that touch and those that are held."""
+def nodes(layout: Layout, sides: str, odd: Parity = EVEN) -> Nodes:
+    """Find the nodes that touch and those that are held; on symmetry planes, fields of a parity are."""
     slab, probe = slab_topology(layout), probe_topology(layout)
     place = np.hstack([slab.doflocs, probe.doflocs])
     split = slab.doflocs.shape[1]
@@ -56,7 +61,8 @@ def nodes(layout: Layout, sides: str) -> Nodes:
     held[chest] = held[glass] = True
     for axis, symmetric in enumerate(layout.symmetric):
         if symmetric:
-            held[np.abs(place[axis]) < 1e-9, axis] = True
+            across = np.arange(3) == axis
+            held |= (np.abs(place[axis]) < 1e-9)[:, None] & (~across if odd[axis] else across)
         if sides == "symmetric":
             held[in_slab & (np.abs(place[axis]) > place[axis, in_slab].max() - 1e-9), axis] = True
     cells = [m.dofs.element_dofs.T.astype(np.int64) for m in (slab, probe)]
@@ -103,9 +109,9 @@ class System:
         return np.asarray(found, dtype=float)
 
 
-@lru_cache(maxsize=4)
-def _system(layout: Layout, sides: str, key: bytes) -> System:
-    found = nodes(layout, sides)
+@lru_cache(maxsize=8)
+def _system(layout: Layout, sides: str, key: bytes, odd: Parity = EVEN) -> System:
+    found = nodes(layout, sides, odd)
     closed = np.frombuffer(key, dtype=bool).reshape(found.contact.shape)
     master = np.arange(found.held.size).reshape(found.held.shape)
     master[found.tip[closed], 2] = master[found.contact[closed], 2]
@@ -114,12 +120,13 @@ def _system(layout: Layout, sides: str, key: bytes) -> System:
     number = np.where(free, np.cumsum(free) - 1, -1)
     unknown = number[master].ravel()
     local = (3 * found.cells[:, :, None] + np.arange(3)).reshape(-1, DOFS)
-    # sets of closed pairs differ in few unknowns: one dissection is good for all
-    like = None if closed.all() else _system(layout, sides, np.ones_like(closed).tobytes()).tree
+    # sets of closed pairs, and parities, differ in few unknowns: one dissection is good for all
+    first = closed.all() and odd == EVEN
+    like = None if first else _system(layout, sides, np.ones_like(closed).tobytes()).tree
     tree = solver.plan(unknown[local], found.centres, like)
     return System(found, closed, unknown, tree)
 
 
-def system(layout: Layout, sides: str, closed: Bools) -> System:
+def system(layout: Layout, sides: str, closed: Bools, odd: Parity = EVEN) -> System:
     """Number the unknowns and plan their elimination; closed pairs (nx, ny) share their z unknown."""
-    return _system(layout, sides, np.ascontiguousarray(closed, dtype=bool).tobytes())
+    return _system(layout, sides, np.ascontiguousarray(closed, dtype=bool).tobytes(), odd)

@@ -310,7 +310,7 @@ def test_bounds_of_solved_presses_are_those_of_finer_tissue(
 
     def press(there: twin.Design, ball: fem.Inclusion, by_multipoles: bool) -> Any:
         assert by_multipoles
-        found = fem.multipoles(there.probe(), there.slab(), "fine", centred=True).press(ball, [1.0])
+        found = fem.multipoles(there.probe(), there.slab(), "fine").press(ball, [1.0])
         return spheres_on_background(found, there.probe(), there.slab(), QUALITIES["reference"])[0]
 
     monkeypatch.setattr(touches, "_press", press)

@@ -88,7 +88,7 @@ def test_a_sphere_does_what_its_multipoles_do(by: str, offset: tuple[float, floa
     (own,) = fem.press(PROBE, SLAB, ball, **{by: [level]}, **how)  # type: ignore[call-overload]
     (shared,) = fem.on_background([own], smooth=True)
     assert mechanics_facts(load_design("tsis"), shared)["signal"] == "smooth"
-    tissue = fem.multipoles(PROBE, SLAB, "preview", centred=(not offset[0], True), degree=DEGREE)
+    tissue = fem.multipoles(PROBE, SLAB, "preview", degree=DEGREE)
     spheres = tissue.press(ball, [own.indentation_mm])
     (other,) = background.spheres_on_background(spheres, PROBE, SLAB, QUALITIES["preview"])
     depths = own.indentation_0_mm / own.indentation_mm  # of the background, other than 1 by force

@@ -45,7 +45,7 @@ _SURELY_TOO_MUCH = 2.0
 
 _OWN = 0.7  # share of the time that a press takes without its background
 
-# Samples of a corpus follow each other in the same tissue, off the middle 1.3 GiB of it; a layout's slopes
+# Samples of a corpus follow each other in the same tissue, off both axes 0.5 GiB of it; a layout's slopes
 # ask for six of every inclusion, coarse, of at most 0.1 GiB each.
 _FINE, _COARSE = (lru_cache(maxsize=size)(fem.multipoles) for size in (2, 8))
 
@@ -240,10 +240,9 @@ def expanded(
         In one line.
     """
     check_expanded(design, inclusion, quality)
-    centred = inclusion is None or not any(inclusion.offset)
     with _in_designs_words():
         tissue = (_COARSE if quality == "preview" else _FINE)(
-            design.probe(), design.slab(), quality, centred, degree=degree
+            design.probe(), design.slab(), quality, degree=degree
         )
         found = tissue.press(inclusion, levels, by_force)
     if by_force:

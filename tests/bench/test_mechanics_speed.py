@@ -219,7 +219,7 @@ def test_linear_where_samples_share(ladders: dict[str, list[Run]], expected: flo
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(SPHERES, "cheapest", CHEAPEST_TISSUE)
         start = time.perf_counter()
-        made = fem.multipoles(PROBE, SLAB, "cheapest", centred=True)
+        made = fem.multipoles(PROBE, SLAB, "cheapest")
         once, worst = time.perf_counter() - start, 0.0
     for ball in (BALL, *OTHERS):
         top = expected if ball == BALL else refined_maximum(ball)
