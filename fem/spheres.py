@@ -57,7 +57,7 @@ class Fineness:
 # and 0.6 % (`pytest -m slow -s tests/test_fem_multipoles.py -k refined`).
 QUALITIES = {
     "preview": Fineness(Resolution(3, 0, 1, 2, 2, 2, 2, 1, 1), 4),
-    "standard": Fineness(Resolution(4, 0, 2, 2, 2, 4, 3, 1, 1), 4),
+    "standard": Fineness(Resolution(4, 0, 2, 2, 2, 5, 3, 1, 1, (0.7, 1.6)), 4),
 }
 
 WITHIN = 0.5
