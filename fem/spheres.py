@@ -54,7 +54,7 @@ class Fineness:
 
 # Largest error of tared maximum and total against 145 thousand unknowns, over (size, depth, modulus) =
 # (10, 5, 100), (12, 7, 40), (8, 6, 110), (13, 4, 120), (4, 6, 60), 1 mm: preview 0.8 and 1.9 %, standard 0.5
-# and 0.6 % (`pytest -m slow -s tests/test_fem_multipoles.py -k refined`).
+# and 0.7 % (`pytest -m slow -s tests/test_fem_multipoles.py -k refined`).
 QUALITIES = {
     "preview": Fineness(Resolution(3, 0, 1, 2, 2, 2, 2, 1, 1), 4),
     "standard": Fineness(Resolution(4, 0, 2, 2, 2, 5, 3, 1, 1, (0.7, 1.6)), 4),
