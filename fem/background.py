@@ -29,7 +29,7 @@ from fem.model import NotModelled, Probe, Slab
 from fem.pressing import Press
 from fem.ripples import DEGREE, expanded, without_ripples
 from fem.spheres import refuse
-from fem.tared import added
+from fem.tared import added, tared
 from fem.topology import Resolution
 
 Floats = NDArray[np.float64]
@@ -126,7 +126,7 @@ def _smooth(
     assert small is not None  # of all flat probes
     tissue = "preview" if res == QUALITIES["preview"] else "standard"
     true = expanded(geometry.probe, geometry.slab, ball, [ball.modulus], DEGREE, to, tissue)
-    rough = _carried(small, lines(first.surface), to)
+    rough = _carried(tared(geometry, small), lines(first.surface), to)
     whole = [
         without_ripples(np.stack(levels), near, fine[0], to)
         for levels, near, fine in zip(zip(*signals, strict=True), rough, true, strict=True)
@@ -136,17 +136,11 @@ def _smooth(
 
 def _over(one: AnyPress, signal: Added, plain: pv.PolyData) -> pv.PolyData:
     """What the inclusion adds, on the surface of plain tissue."""
-    own, (rise, moved), found, depth = (
-        one.surface.point_data,
-        signal,
-        plain.copy(deep=True),
-        one.indentation_mm,
-    )
-    to = lines(one.surface), lines(plain)
+    own, found, (rise, moved) = one.surface.point_data, plain.copy(deep=True), signal
+    to, depth = (lines(one.surface), lines(plain)), one.indentation_mm
     times = depth / one.indentation_0_mm  # other than 1 where both are pressed by one force
-    found.point_data["displacement"] = times * np.asarray(plain["displacement_0"]) + depth * moved.reshape(
-        -1, 3
-    )
+    more = depth * moved.reshape(-1, 3)
+    found.point_data["displacement"] = times * np.asarray(plain["displacement_0"]) + more
     factors = {
         "pressure": times * (1.0 + rise.ravel()),
         "area": carry(np.asarray(own["area"]) / np.asarray(own["area_0"]), *to),

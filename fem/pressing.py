@@ -21,7 +21,6 @@ from fem.meshed import build, moduli
 from fem.model import Inclusion, NotConverged, NotModelled, Pose, Probe, Slab, check
 from fem.path import path
 from fem.solver import one_thread
-from fem.tared import tared_at_rest
 from fem.topology import Layout, Resolution, materials, probe_topology, slab_topology
 from fem.trust import discretisation_error
 
@@ -90,9 +89,7 @@ class Press:
     error_percent: float
     _states: tuple[State, State] = field(repr=False)
     _geometry: Geometry = field(repr=False)
-    _small: tuple[Floats, Floats] | None = field(
-        default=None, repr=False
-    )  # `tared_at_rest`, of closed contact
+    _small: tuple[State, State] | None = field(default=None, repr=False)  # small strain per mm, if closed
     background: str = "own"
     signal: str = "meshed"
 
@@ -329,7 +326,7 @@ def _presses(
                     one.rate()
             for geometry, full in zip(geometries, paths, strict=True):
                 error = discretisation_error(geometry, res, full, bare) if estimate else np.nan
-                small = tared_at_rest(geometry, full, bare) if flat and geometry.inclusion else None
+                small = (full.per_mm(), bare.per_mm()) if flat and geometry.inclusion else None
                 step("error estimate")
                 found: dict[float, Press] = {}
                 for level in sorted(set(levels)):
@@ -357,7 +354,7 @@ def _materials(geometry: Geometry, layout: Layout) -> NDArray[np.int64]:
 def _press(
     geometry: Geometry,
     states: tuple[State, State],
-    small: tuple[Floats, Floats] | None,
+    small: tuple[State, State] | None,
     mechanics: Mechanics,
     res: Resolution,
     error: float,

@@ -21,8 +21,7 @@ def tared(geometry: Geometry, states: tuple[State, State]) -> tuple[Floats, Floa
 
 
 def tared_at_rest(geometry: Geometry, full: Path, bare: Path) -> tuple[Floats, Floats]:
-    """The same at small strain, of paths on an undeformed mesh; next to nothing as long as it is their first
-    use."""
+    """The same at small strain, of paths that are not yet used."""
     return tared(geometry, (full.per_mm(), bare.per_mm()))
 
 
