@@ -22,7 +22,7 @@ Floats = NDArray[np.float64]
 # Largest error of tared maximum and total against 145 thousand unknowns, over (size, depth, modulus) =
 # (10, 5, 100), (4, 6, 60), (13, 4, 120), (8, 5, 60), 1 mm of small strain: preview 2.3 %, standard 0.4 %,
 # reference 0.2 % (`make bench` prints the table). Shells outside the sphere and cells along its arc matter
-# most for these; cells towards the probe's edge for the displacement there. Tared *pressure* is 1.3 to 1.8 %
+# most for these; cells towards the probe's edge for the displacement there. Tared *pressure* is 1.5 to 2.0 %
 # too high at its maximum at all three (`pytest -m slow -s tests/test_fem_ripples.py -k nearer`).
 QUALITIES = {
     "preview": Resolution(

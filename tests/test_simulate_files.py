@@ -69,10 +69,10 @@ def test_frame_json_has_exactly_the_promised_keys(frame, folder):
     assert record["inclusion"] == {**lies, "stretch": [1, 1, 1]}
     assert set(record["press"]) == {"indentation_mm", "force_N", "position_mm", "tilt_deg"}
     assert (record["press"]["position_mm"], record["press"]["tilt_deg"]) == ([0, 0], [0, 0])
-    trust = {"min_pressure_kPa", "path", "background", "mechanics", "error_percent"}
+    trust = {"min_pressure_kPa", "path", "background", "signal", "mechanics", "error_percent"}
     assert set(record["fem"]) == {"raw", "tared", "dof", "seconds", *trust}
     assert (record["fem"]["path"], record["fem"]["mechanics"]) == ("tied", "linear")
-    assert record["fem"]["background"] == "shared"
+    assert (record["fem"]["background"], record["fem"]["signal"]) == ("shared", "meshed")
     assert set(record["fem"]["raw"]) == set(record["fem"]["tared"]) == {"max_mm", "total_mm3", "area_mm2"}
     told = {"frames", "reference_frames", "seconds", "noise_percent", "saturated_percent"}
     told |= {"bias_percent", "bias_of"}
