@@ -45,7 +45,7 @@ _SURELY_TOO_MUCH = 2.0
 
 _OWN = 0.7  # share of the time that a press takes without its background
 
-# Samples of a corpus follow each other in the same tissue, off both axes 0.5 GiB of it; a layout's slopes
+# Samples of a corpus follow each other in the same tissue, off both axes 0.3 GiB of it; a layout's slopes
 # ask for six of every inclusion, coarse, of at most 0.1 GiB each.
 _FINE, _COARSE = (lru_cache(maxsize=size)(fem.multipoles) for size in (2, 8))
 
