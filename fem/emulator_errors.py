@@ -36,11 +36,11 @@ class Errors:
     finite strain scatters by some per cent. `size_mm` (n,) is the inclusion's. `finer` (p, 6),
     `finer_more` (q, 6): the same of what a finer mesh adds to the tared pressure, then to the tared
     displacement, of centred samples, and to what finite strain adds to them (q 0 for a linear one).
-    `curve` (rows, 9): number of samples at small and at finite strain, core seconds they took, and of a
-    common set of held-out samples with `size_mm` >= 4 the median and the 95th percentile of each of the
-    pressure's three errors. `solves` (4, 2): of samples, of pairs of a fine and a lean mesh, of samples at
-    finite strain and of pairs of those, how many were tried, and how many of them failed and are missing
-    from all this.
+    `curve` (rows, 9): number of samples at small and at finite strain, core seconds they took (pairs of
+    meshes apart), and of a common set of held-out samples with `size_mm` >= 4 the median and the 95th
+    percentile of each of the pressure's three errors. `solves` (4, 2): of samples, of pairs of a fine and a
+    lean mesh, of samples at finite strain and of pairs of those, how many were tried, and how many of them
+    failed and are missing from all this.
     """
 
     size_mm: Floats

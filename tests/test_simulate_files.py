@@ -72,7 +72,7 @@ def test_frame_json_has_exactly_the_promised_keys(frame, folder):
     trust = {"min_pressure_kPa", "path", "background", "signal", "mechanics", "error_percent"}
     assert set(record["fem"]) == {"raw", "tared", "dof", "seconds", *trust}
     assert (record["fem"]["path"], record["fem"]["mechanics"]) == ("tied", "linear")
-    assert (record["fem"]["background"], record["fem"]["signal"]) == ("shared", "meshed")
+    assert (record["fem"]["background"], record["fem"]["signal"]) == ("shared", "smooth")
     assert set(record["fem"]["raw"]) == set(record["fem"]["tared"]) == {"max_mm", "total_mm3", "area_mm2"}
     told = {"frames", "reference_frames", "seconds", "noise_percent", "saturated_percent"}
     told |= {"bias_percent", "bias_of"}

@@ -126,10 +126,11 @@ def summary(emulator: fem.Emulator, out: str) -> str:
             for name, column in (("pressure", 0), ("displacement", 3)):
                 typical, bad = (percent_in_words(float(np.percentile(found[:, column], p))) for p in (50, 95))
                 lines.append(f"what the standard mesh adds to tared {name}{what}: off by {typical} and {bad}")
-    for count, more, seconds, median, bad, *_ in errors.curve:
+    for count, more, seconds, median, bad, mean, worse, *_ in errors.curve:
         solves = f"{count:.0f} samples" + (f" ({more:.0f} at finite strain)" if more else "")
         lines.append(
-            f"with {solves}, {seconds / 60:.0f} core minutes: pressure {median:.2g} % and {bad:.2g} %"
+            f"with {solves}, {seconds / 60:.0f} core minutes beside pairs of meshes: pressure, largest off "
+            f"the edge {median:.2g} % and {bad:.2g} %; root mean square {mean:.2g} % and {worse:.2g} %"
         )
     failed = int(errors.solves[:, 1].sum())
     lines.append(f"solves that failed: {failed} of {int(errors.solves[:, 0].sum())}")
@@ -145,11 +146,10 @@ def _errors(errors: Errors, what: str, size: float) -> Iterator[str]:
         return
     if ((of >= LARGE) != (size >= LARGE)).any():  # too few of its kind
         what += f", by the nearest samples of {of.min():.2g} to {of.max():.2g} mm"
+    kinds = ("largest off the edge", "root mean square over the surface", "largest on all of it")
     for name in ("pressure", "displacement"):
-        typical, bad = (percent_in_words(errors.percentile(name, percent, size)) for percent in (50, 95))
-        yield (
-            f"tared {name}, {what}: largest error off the edge {typical} of its maximum (median of "
-            f"held-out samples), {bad} (95th percentile)"
-        )
-    typical, bad = (percent_in_words(errors.percentile("pressure", percent, size, 2)) for percent in (50, 95))
-    yield f"tared pressure, {what}: on the whole surface {typical} and {bad}"
+        told = []
+        for kind, words in enumerate(kinds):
+            typical, bad = (percent_in_words(errors.percentile(name, p, size, kind)) for p in (50, 95))
+            told.append(f"{words} {typical} and {bad}")
+        yield f"tared {name}, {what}, median and 95th percentile over its maximum: {'; '.join(told)}"

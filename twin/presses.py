@@ -138,7 +138,7 @@ def solved(
         if pictured:
             if tell is not None:
                 tell("background", own)
-            presses = fem.on_background(presses)
+            presses = fem.on_background(presses, smooth=True)
     except ValueError as error:
         # what the mesh cannot follow comes as a plain ValueError in the same words
         if type(error) is ValueError and ": received " in str(error):
