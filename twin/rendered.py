@@ -12,10 +12,11 @@ from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pyvista as pv
 from numpy.typing import NDArray
 
 import fem
-from scenes.surface import resample
+from scenes.surface import OpticalSurface, resample
 from scenes.traced import TracedLight
 from twin import presses, retake
 from twin.chain import BLOCK, Chain, seen_by, whole_blocks
@@ -60,17 +61,15 @@ def rendered(
     inclusion = fem.Inclusion(size, depth, modulus, (x, y))
     presses.check_emulated(design, inclusion, depths, chain.emulator)
     seen_by_camera, binned = coarser(chain.design) if quick else (chain.design, 1)
-    renderer, width = _renderer(seen_by_camera), chain.design.waveguide.width_mm
+    renderer = renderer_of(seen_by_camera)
     block = BLOCK[0] // binned, BLOCK[1] // binned
-    felt = np.float64(_yields(chain.design) / _yields(design))
     flux = np.array([led.flux_W for led in design.leds])
     weights = chain.fluxes(values) / flux / chain.gain(values) / binned**2
     found = []
     for press in presses.emulated(design, inclusion, depths, chain.emulator):
         pair = []
         for suffix in ("",) if quick else ("", "_0"):
-            shape = resample(press.surface, width, suffix=suffix)
-            shape = replace(shape, pressure_kPa=felt * shape.pressure_kPa)
+            shape = felt(chain.design, design, press.surface, suffix)
             layers = renderer.render(shape, quality="preview", traced=tuple(traced), coarse=quick).radiance
             pixels = retake.charge(seen_by_camera, layers, weights, (1, 1))
             pair.append(retake.average(whole_blocks(pixels, block), block))
@@ -86,9 +85,16 @@ def coarser(design: Design) -> tuple[Design, int]:
     return replace(design, camera=replace(camera, binning=_BINNED * camera.binning)), _BINNED
 
 
+def felt(base: Design, design: Design, surface: pv.PolyData, suffix: str = "") -> OpticalSurface:
+    """Return a contact surface under the skin and tissue of one design, as the scene of another is to have
+    it: what they change in the contact's law is a share of the pressure. ``suffix`` is that of fields."""
+    shape = resample(surface, base.waveguide.width_mm, suffix=suffix)
+    return replace(shape, pressure_kPa=np.float64(_yields(base) / _yields(design)) * shape.pressure_kPa)
+
+
 @lru_cache(maxsize=2)
-def _renderer(design: Design) -> SpectralRenderer:
-    """The scene of a design, built once: what varies of the skin and the tissue is felt as pressure."""
+def renderer_of(design: Design) -> SpectralRenderer:
+    """Return the scene of a design, built once: skin and tissue that vary are told by `felt`."""
     from scenes import SpectralRenderer
 
     return SpectralRenderer(design.sensor(), count=design.light.bands, at=design.sensor, device="cpu")

@@ -6,7 +6,6 @@ TWIN_MODEL=tsis TWIN_CORPUS=corpora/phantoms TWIN_SAMPLES=6,7 \\
 
 import os
 from collections.abc import Callable
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,7 +16,6 @@ from numpy.typing import NDArray
 import fem
 import twin
 from fem.ground import carry, lines
-from scenes.surface import resample
 from twin import fitting, presses, rendered, retake
 from twin.chain import BLOCK, seen_by, whole_blocks
 from twin.estimator import Estimator
@@ -105,14 +103,12 @@ def put(own: Any, solved: Any, fields: tuple[str, ...], plain: bool) -> Any:
 def followed(estimator: Estimator, design: Any, values: dict[str, float], surfaces: Any, seed: int) -> Floats:
     """Coarse counts (levels, 2, r, c) in standard light of paths of their own."""
     chain = estimator.chain
-    renderer, width = rendered._renderer(chain.design), chain.design.waveguide.width_mm
-    felt = rendered._yields(chain.design) / rendered._yields(design)
+    renderer = rendered.renderer_of(chain.design)
     weights = chain.fluxes(values) / np.array([led.flux_W for led in design.leds]) / chain.gain(values)
     found = []
     for surface in surfaces:
         for suffix in ("", "_0"):
-            shape = resample(surface, width, suffix=suffix)
-            shape = replace(shape, pressure_kPa=felt * shape.pressure_kPa)
+            shape = rendered.felt(chain.design, design, surface, suffix)
             layers = renderer.render(shape, quality="standard", samples=PATHS, seed=seed).radiance
             pixels = retake.charge(chain.design, layers, weights, (1, 1))
             found.append(retake.average(whole_blocks(pixels, BLOCK), BLOCK))
