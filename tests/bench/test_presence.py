@@ -17,7 +17,9 @@ from twin.received import Received
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif("TWIN_MODEL" not in os.environ, reason="needs TWIN_MODEL and TWIN_CORPUS"),
+    pytest.mark.skipif(  # one alone is an error
+        not {"TWIN_MODEL", "TWIN_CORPUS"} & set(os.environ), reason="needs TWIN_MODEL and TWIN_CORPUS"
+    ),
 ]
 
 
@@ -43,4 +45,4 @@ def test_inclusions_are_told_from_none() -> None:
         print(number, "with {:.3g}, network {:.3g}; without {:.3g}, network {:.3g}".format(*chances))
         told.append(chances)
     there, _, absent, _ = np.transpose(told)
-    assert there.min() > 0.5 > absent.max()
+    assert there.min() > 0.999 and absent.max() < 0.001
