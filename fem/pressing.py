@@ -21,8 +21,10 @@ from fem.meshed import build, moduli
 from fem.model import Inclusion, NotConverged, NotModelled, Pose, Probe, Slab, check
 from fem.path import path
 from fem.solver import one_thread
+from fem.tared import added, tared
 from fem.topology import Layout, Resolution, materials, probe_topology, slab_topology
 from fem.trust import discretisation_error
+from fem.wrinkles import refuse_wrinkles
 
 Floats = NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -214,7 +216,7 @@ def press(
     NotModelled
         On possible input that is not modelled.
     NotConverged
-        If no equilibrium is found, in one line.
+        If no equilibrium is found, or only one whose contact has wrinkled, in one line.
 
     Example
     -------
@@ -373,6 +375,9 @@ def _press(
         mirror=layout.symmetric[0],
     )
     closed = all(state.closed.all() for state in states)
+    if closed and small is not None and model.finite:
+        rise, _ = added(contact, states[0].indentation, states[1].indentation)
+        refuse_wrinkles(rise, tared(geometry, small)[0], states[0].indentation)
     forces = [1e-3 * model.share * float(state.force.sum()) for state in states]
     return Press(
         contact,

@@ -48,6 +48,7 @@ from fem.solver import one_thread
 from fem.spheres import refuse
 from fem.tared import tared, tared_at_rest
 from fem.topology import Resolution
+from fem.wrinkles import refuse_wrinkles
 
 Floats = NDArray[np.float64]
 Some = TypeVar("Some", float, Floats)
@@ -300,7 +301,7 @@ def stretch(plan: Plan, point: Floats) -> dict[str, Floats]:
     Raises
     ------
     NotConverged, NotModelled
-        If no equilibrium is found at one of the levels.
+        If no equilibrium is found at one of the levels, or only one whose contact has wrinkled.
     """
     ratio = (1 + 1.5 * point[6]) / (1 - point[6])
     geometry, res = geometry_at(plan, point, float(ratio * point[5])), plan.coarse
@@ -310,6 +311,8 @@ def stretch(plan: Plan, point: Floats) -> dict[str, Floats]:
         full = path(geometry, model, True, bare)
         small = tared_at_rest(geometry, full, bare)
         found = [tared(geometry, (full.to(level), bare.to(level))) for level in plan.levels[1:].tolist()]
+    for level, (rise, _) in zip(plan.levels[1:].tolist(), found, strict=True):
+        refuse_wrinkles(rise, small[0], level)
     whole, true = [np.stack([f[k] for f in found]) for k in range(2)], small
     if plan.degree:
         smooth = _expanded(plan, point, np.array([ratio]), res)
