@@ -21,6 +21,7 @@ from twin.learn_light import light_of
 from twin.retake import average
 
 BALL = fem.Inclusion(10.0, 5.0, 100.0)
+CORNER_MM = 10.5  # beyond it along both axes: 2 mm of each corner, of which the outermost is left out
 
 
 @pytest.mark.parametrize("name", learned.shipped())
@@ -93,26 +94,32 @@ def test_light_beside_the_rim_follows_the_press_without_a_jump(variant: str) -> 
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1200)
 @pytest.mark.parametrize(
     "ball, mean, worst",
     [(fem.Inclusion(9.3, 5.6, 83.0), 0.2, 0.9), (fem.Inclusion(11.4, 4.7, 60.0, (1.1, -0.7)), 0.25, 1.2)],
 )
 def test_the_shipped_emulator_against_full_solves(ball, mean, worst):
     """Finite strain at standard quality, specimens that it did not see. What that mesh adds was learned under
-    the middle: beside it twice as much is left."""
+    the middle: beside it twice as much is left. At the face's corners, which begin to give way there
+    (`tests/test_fem_corner.py`), pairs of meshes of large inclusions are up to 14 % of the signal apart at
+    3 mm (1 % at 2 mm), from one pair to the next without rule: twice as much is allowed there."""
     design = on_another_slab(28.7, 5.3)
     levels = [1.0, 2.0, 2.9]
     guessed = presses.emulated(design, ball, levels, presses.emulator_of(design, None))
     solved = presses.solved(design, ball, levels, quality="standard", pictured=True)
     for level, guess, press in zip(levels, guessed, solved, strict=True):
         assert np.allclose(guess.surface.points, press.surface.points)
-        inner = off_the_edge(np.unique(press.surface.points[:, 0])).ravel()
+        x = np.unique(press.surface.points[:, 0])
+        inner = off_the_edge(x).ravel()
+        corner = np.logical_and.outer(np.abs(x) > CORNER_MM, np.abs(x) > CORNER_MM).ravel()[inner]
         for name in ("pressure", "displacement"):
             true, found = (tared(one.surface, name)[inner] for one in (press, guess))
-            miss, top = found - true, np.abs(true).max()
-            percent = 100 * np.sqrt((miss**2).mean()) / top, 100 * np.abs(miss).max() / top
-            print(f"{ball}, {level} mm: tared {name} {percent[0]:.2f} % rms, {percent[1]:.2f} % at worst")
-            assert percent[0] < mean and percent[1] < worst
+            off = 100 * np.abs(found - true) / np.abs(true).max()
+            rms, most, there = np.sqrt((off**2).mean()), off[~corner].max(), off[corner].max()
+            print(f"{ball}, {level} mm: tared {name} {rms:.2f} % rms, {most:.2f} % at worst, ", end="")
+            print(f"{there:.2f} % at the corners")
+            assert rms < mean and most < worst and there < 2 * worst
 
 
 def tared(surface: Any, name: str) -> np.ndarray:
