@@ -29,7 +29,7 @@ _DEAD = (
     "workers: received one that ended by itself, killed or out of memory; allowed are as many as the memory "
     "holds (what is solved is kept: the same call goes on)"
 )
-_FORMAT = 8  # of a folder: its files, and the mechanics they are solved by (8: cells of multipoles' tissue)
+_FORMAT = 9  # of a folder: its files, and the mechanics they are solved by (9: wrinkled presses are gaps)
 _SHARE = 8  # samples for each pair of a fine and a lean or coarse mesh
 STRETCHED = 3  # samples for each one at finite strain, which is the same specimen as an earlier one
 _FIRST = 16  # pairs of each kind that come with one sample each
