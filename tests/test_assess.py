@@ -102,6 +102,20 @@ def test_means_of_some_of_the_samples_are_told_of_these(tmp_path: Any) -> None:
     assert "mean of 100" not in assessing_report.write(tmp_path).read_text(encoding="utf-8")
 
 
+def test_means_alone(tmp_path: Any) -> None:
+    """`--single 0`: nothing is said of one exposure."""
+    means = rows()
+    for row in means:
+        del row["1"]
+    record = record_of(means, RANGES, True) | {"corpus_name": "made up"}
+    assert "1" not in record and record["100"] == record_of(rows(), RANGES, True)["100"]
+    assert "1 exposure " not in words(record)
+    write_json(tmp_path / "assessment.json", record)
+    draw({100: answered(means, 100, "rendered")}, RANGES, 5.0, tmp_path / "assessment.png")
+    page = assessing_report.write(tmp_path).read_text(encoding="utf-8")
+    assert "mean of 100" in page and "one exposure" not in page
+
+
 def test_the_page_holds_the_tables_and_a_learning_curve(tmp_path: Any) -> None:
     """All in one file, of whatever lies in the folder; a browser has nothing to complain of."""
     curve = {"corpus": "made up", "model": "m", "tested": 60, "parameters": [], "bound": [0.05, 0.03, 12.0]}

@@ -325,6 +325,10 @@ def twin(*arguments, folder):
         # Found only once the work is under way: these too are the only line there is.
         ([*FINE, "--device", "cuda"], ["--device", "'cuda'", "allowed"]),
         (["train", "corpus", "--device", "cuda", "--out", "model"], ["--device", "'cuda'", "allowed"]),
+        (
+            ["assess", "tsis", "corpus", "--single", "0", "--averaged", "0", "--out", "o"],
+            ["--single", "0, 0"],
+        ),
         ([*FINE, "--force", "9", "--quality", "preview"], ["--force", "9.0", "<= about"]),
         (
             [*FINE, "--force", "2", "--quality", "preview", "--mechanics", "linear"],

@@ -163,6 +163,7 @@ def test_files_that_are_not_there_or_no_files(files, tmp_path):
     )
     assert "no such file" in refused([*images[:2], "a\0b"], wanted(SENSOR), references=references)
     assert "too long" in refused([*images[:2], "a" * 300], wanted(SENSOR), references=references)
+    assert "no such file or folder; allowed a folder" in refused([tmp_path / "none"], wanted(SENSOR))
     assert "a file beside folders" in refused([*images[:2], tmp_path], wanted(SENSOR), references=references)
     import os
 

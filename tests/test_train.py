@@ -126,6 +126,12 @@ def test_a_corpus_that_cannot_teach_is_refused(tmp_path):
         train(place, tmp_path / "m", minutes=0.1)
 
 
+def test_a_corpus_of_few_samples_is_refused_before_any_is_read(finished_corpus, tmp_path):
+    with pytest.raises(DesignError, match="samples: received 4 samples; allowed 30 or more"):
+        train(finished_corpus, tmp_path / "m", minutes=0.1)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_only_a_model_that_renders_is_calibrated(corpus, model, tmp_path):
     with pytest.raises(DesignError, match="without learned light"):
         calibrate(model, corpus, tmp_path / "m")

@@ -69,6 +69,7 @@ def assess(
     out: str | Path,
     *,
     samples: int | None = None,
+    single: int | None = None,
     averaged: int | None = None,
     rendered: bool = True,
     as_trained: bool = False,
@@ -81,7 +82,8 @@ def assess(
     Parameters
     ----------
     samples : how many at most; of the group "test" where there is one.
-    averaged : of how many of these, the first, means of many exposures are answered, too; all by default.
+    single, averaged : of how many of these, the first, single exposures and means of many are answered; all
+        by default. Where both are, fits to means begin where those to single exposures end.
     rendered : whether answers are refined by rendering, too: a minute or two a sample.
     as_trained : whether a calibrated model is taken as it was before `twin calibrate`: that is right for
         pictures of its own chain.
@@ -91,6 +93,8 @@ def assess(
     DesignError
         In one line.
     """
+    if single == 0 and averaged == 0:
+        raise DesignError("--single, --averaged", "0, 0", "one of them above 0")
     source, estimator = Corpus(corpus), load_estimator(model)
     levels_of(source, estimator)
     numbers = [int(n) for n in source.samples if source.plan.group(int(n)) == TEST]
@@ -104,19 +108,14 @@ def assess(
         **({"as_trained": True} if as_trained else {}),
     }
     _claim(folder, told)
-    tasks = [
-        Task(
-            str(model),
-            str(corpus),
-            number,
-            folder / SAMPLES / f"{number:06d}.json",
-            rendered,
-            seed,
-            FRAMES if averaged is None or place < averaged else FRAMES[:1],
-            as_trained,
-        )
-        for place, number in enumerate(numbers)
-    ]
+    tasks = []
+    for place, number in enumerate(numbers):
+        asked = zip(FRAMES, (single, averaged), strict=True)
+        exposures = tuple(frames for frames, most in asked if most is None or place < most)
+        if exposures:
+            kept = folder / SAMPLES / f"{number:06d}.json"
+            parts = (str(model), str(corpus), number, kept, rendered, seed)
+            tasks.append(Task(*parts, exposures, as_trained))
     left = [task for task in tasks if not _done(task)]
 
     def share(count: int) -> None:

@@ -30,6 +30,7 @@ curve of the light map, which the report of the same DIR shows, too.
 examples:
   twin assess models/tsis corpora/pictures --out assessed
   twin assess models/tsis corpora/pictures --averaged 100 --out assessed
+  twin assess tsis corpora/held-out --as-trained --single 0 --out averaged
   twin assess models/tsis corpora/pictures --quick --out quick
   twin assess models/tsis corpora/solved --samples 20 --out mismatch
   twin assess tsis corpora/held-out --as-trained --out matched
@@ -105,6 +106,12 @@ def add(verbs: Any) -> None:
     assess.add_argument("corpus", metavar="CORPUS", help="folder of a finished corpus")
     assess.add_argument("--out", metavar="DIR", help="folder for the assessment")
     assess.add_argument("--samples", type=whole, metavar="N", help="at most so many (default: all)")
+    assess.add_argument(
+        "--single",
+        type=whole,
+        metavar="N",
+        help="answer single exposures of at most so many (default: all)",
+    )
     assess.add_argument(
         "--averaged",
         type=whole,

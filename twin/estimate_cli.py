@@ -78,6 +78,7 @@ def _assess(arguments: argparse.Namespace) -> int:
     if arguments.curve:
         for flag, given in (
             ("--samples", arguments.samples),
+            ("--single", arguments.single),
             ("--averaged", arguments.averaged),
             ("--quick", arguments.quick),
             ("--as-trained", arguments.as_trained),
@@ -88,7 +89,7 @@ def _assess(arguments: argparse.Namespace) -> int:
                 raise DesignError(
                     flag,
                     "it with --curve",
-                    "none of --samples, --averaged, --quick, --as-trained, --workers, --seed",
+                    "none of --samples, --single, --averaged, --quick, --as-trained, --workers, --seed",
                 )
         with Reporter() as report:
             told = learning_curve.curve(arguments.model, arguments.corpus, arguments.out, progress=report)
@@ -101,6 +102,7 @@ def _assess(arguments: argparse.Namespace) -> int:
             arguments.corpus,
             arguments.out,
             samples=arguments.samples,
+            single=arguments.single,
             averaged=arguments.averaged,
             as_trained=arguments.as_trained,
             rendered=not arguments.quick,

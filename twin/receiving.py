@@ -61,6 +61,9 @@ def receive(
         raise DesignError("--frames", shown(exposures), "an integer > 0")
     places = [Path(frame) for frame in frames]
     folders = [place for place in places if os.path.isdir(place)]  # False for any odd name
+    if len(places) == 1 and not os.path.lexists(places[0]):  # a mistyped folder, not one file of several
+        allowed = f"a {_SIMULATED}, or a PNG file for each press level"
+        raise DesignError(str(places[0]), "no such file or folder", allowed)
     if not folders:
         return _from_camera(places, [Path(name) for name in references], wanted, exposures, flip)
     if len(folders) < len(places):

@@ -124,6 +124,11 @@ def train(
     parts = place.with_name(place.name.removesuffix(".safetensors") + ".parts")
     plan = source.plan
     design = of_levels(source, levels)
+    groups = np.array([plan.group(int(number)) for number in source.samples])
+    learned = np.flatnonzero(groups != TEST)[:samples]
+    if len(learned) < _LEAST:
+        allowed = f"{_LEAST} or more outside the group {TEST!r}"
+        raise DesignError("samples", f"{len(learned)} samples", allowed, source=source.name)
     many = specimens(plan, imagined, seed)
     if plan.emulator is None:
         raise DesignError("mechanics", shown(plan.mechanics), '"emulator"', source=source.name)
@@ -134,19 +139,13 @@ def train(
     chosen = tuple(range(source.levels)) if levels is None else tuple(levels)
     parts.mkdir(parents=True, exist_ok=True)
     seen = gather(source, emulator, parts, lambda share: tell("pictures", 0.2 * share))
-    groups = np.array([plan.group(int(number)) for number in seen.numbers])
     seen = replace(
         seen,
         values=[level_names(one, chosen) for one in seen.values],
         contacts=seen.contacts[:, list(chosen)],
         charges=seen.charges[:, list(chosen)],
     )
-    learning, testing = seen.of(np.flatnonzero(groups != TEST)[:samples]), seen.of(groups == TEST)
-    if len(learning.numbers) < _LEAST:
-        received = f"{len(learning.numbers)} samples"
-        raise DesignError(
-            "samples", received, f"{_LEAST} or more outside the group {TEST!r}", source=source.name
-        )
+    learning, testing = seen.of(learned), seen.of(groups == TEST)
     many = [level_names(one, chosen) for one in many]
     chain, errors = learn_light(design, emulator, learning)
     inputs = inputs_of(
