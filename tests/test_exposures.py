@@ -88,3 +88,18 @@ def test_rounding_is_known() -> None:
         known = rounding(design, counts, np.array([design.camera.gain_e_per_dn]))
         assert np.allclose(off[0, 0], off[0, 1], atol=1e-5)
         assert np.std(off - known) < left * np.std(off)
+
+
+@pytest.mark.parametrize("top", [8.0, 25.0, 150.0])
+def test_rounding_of_pixels_is_known_with_their_pattern(top: float) -> None:
+    """What the mean of endless exposures of each pixel is off by, and of blocks: to single precision."""
+    design = small()
+    camera, light, gain = design.camera, radiance(design, top), design.camera.gain_e_per_dn
+    charge = retake.charges(design, light, (1, 1)).sum(axis=0)
+    dark = fixed_pattern(camera)[1] + camera.dark_current_e_s * camera.exposure_ms * 1e-3
+    truth = (charge.astype(float) + dark) / gain + camera.offset_dn
+    off = retake.mean_of(design, light, 10**16, np.random.default_rng(3)) - truth
+    left = off - retake.rounding(design, charge / np.float32(gain), gain)
+    assert np.abs(left).max() < 1e-4
+    in_blocks = [np.std(retake.average(np.float32(one), BLOCK)) for one in (left, off)]
+    assert in_blocks[0] < 1e-2 * in_blocks[1] or in_blocks[1] < 1e-5

@@ -16,7 +16,7 @@ from estimation.posterior import MOST_FRAMES, REFERENCE_FRAMES, Posterior
 from scenes.sensor import NotModelled
 from scenes.traced import TracedLight
 from twin import likeness
-from twin.block_noise import mean_variance, rounding
+from twin.block_noise import mean_variance
 from twin.chain import BLOCK, Chain, whole_blocks
 from twin.discrepancy import Discrepancy
 from twin.estimates import NAMES, Estimate
@@ -178,8 +178,7 @@ class Estimator:
 
         def pictures(values: Mapping[str, float], quick: bool = False) -> Single:
             values = reachable(self.chain, dict(values))
-            seen = render(self.chain, self.traced, values, threads=threads, quick=quick)
-            return seen + rounding(self.chain.design, seen, np.array(self.chain.gain(values)))
+            return render(self.chain, self.traced, values, threads=threads, quick=quick, rounded=True)
 
         try:
             return refine(

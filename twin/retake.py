@@ -31,6 +31,7 @@ from twin.design import Design
 Float = NDArray[np.float32]
 
 _HARMONICS = 6  # of rounding
+_SMOOTH = 0.6  # counts², variance of a pixel from which on rounding does nothing: 2e-6 counts
 
 
 def average(picture: NDArray[Any], block: tuple[int, int]) -> Float:
@@ -161,11 +162,37 @@ def mean_of(
     charge += camera.dark_current_e_s * camera.exposure_ms * 1e-3 * camera.binning**2
     found = (charge + offset) / camera.gain_e_per_dn + camera.offset_dn
     variance = (charge + camera.read_noise_e**2) / camera.gain_e_per_dn**2
-    turn, blur, spread = 2.0 * np.pi * found, np.exp(-2.0 * np.pi**2 * variance), variance + 1.0 / 12.0
-    for k, part in enumerate(squares(blur), start=1):
-        found = found + (-1) ** k / (np.pi * k) * np.sin(k * turn) * part
-        spread = spread - part**2 / (2.0 * np.pi**2 * k * k)
+    shift, spread = _rounded(found, variance)
+    found = found + shift
     return np.asarray(found + np.sqrt(np.maximum(spread, 0.0) / frames) * rng.standard_normal(found.shape))
+
+
+def _rounded(mean: NDArray[np.float64], variance: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    """How far a rounded count's mean is above that before rounding, and its variance, of a count's mean and
+    variance before; see `mean_of`."""
+    turn, blur, spread = 2.0 * np.pi * mean, np.exp(-2.0 * np.pi**2 * variance), variance + 1.0 / 12.0
+    shift = np.zeros_like(mean)
+    for k, part in enumerate(squares(blur), start=1):
+        shift += (-1) ** k / (np.pi * k) * np.sin(k * turn) * part
+        spread = spread - part**2 / (2.0 * np.pi**2 * k * k)
+    return shift, spread
+
+
+def rounding(design: Design, counts: Float, gain: float) -> Float:
+    """Return how far above the light the mean of many exposures is, counts, of each pixel of a picture
+    (rows, columns) of so many counts above black; gain in electrons per count.
+
+    The camera's own pattern is known. It leaves the pixels of a block in no common phase: what their mean is
+    off from one that they would share is as large as the noise of 100 exposures where light is dim.
+    """
+    camera = design.camera
+    dark = camera.dark_current_e_s * camera.exposure_ms * 1e-3 * camera.binning**2
+    found, light = np.zeros_like(counts), np.maximum(counts, 0.0)
+    variance = (light * gain + dark + camera.read_noise_e**2) / gain**2
+    waves = variance < _SMOOTH
+    mean = light + (dark + fixed_pattern(camera)[1]) / gain + camera.offset_dn
+    found[waves] = _rounded(mean[waves], variance[waves].astype(np.float64))[0]
+    return found
 
 
 def squares(blur: NDArray[Any]) -> Iterator[NDArray[Any]]:

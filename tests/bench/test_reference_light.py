@@ -25,7 +25,6 @@ import fem
 from estimation.features import Features
 from estimation.posterior import REFERENCE_FRAMES
 from twin import presses, rendered, retake
-from twin.block_noise import rounding
 from twin.chain import BLOCK, Chain, whole_blocks
 from twin.design import Design
 from twin.discrepancy import shrunk
@@ -151,8 +150,7 @@ def test_phantoms_in_reference_light_are_told(estimator: Estimator, passes: Floa
     always = sight.off(seen) + noise / len(charges)
 
     def pictures(values: Any, quick: bool = False) -> NDArray[np.float32]:
-        light = rendered.rendered(chain, estimator.traced, values, quick=quick)
-        return light + rounding(design, light, np.array(chain.gain(values)))
+        return rendered.rendered(chain, estimator.traced, values, quick=quick, rounded=True)
 
     start = np.concatenate([prior.ranges.mean(axis=1), np.zeros(prior.basis.shape[1])])
     parts = (chain, sight.features, prior, sight.error, sight.told(seen), 1.0, start, pictures)

@@ -17,7 +17,6 @@ import twin
 from twin import likeness
 from twin.assess import averaged, stored
 from twin.assessing import levels_of, values_of
-from twin.block_noise import rounding
 from twin.complaint import DesignError
 from twin.estimates import NAMES
 from twin.estimator import Estimator, black
@@ -114,13 +113,14 @@ def test_noise_alone_explains_what_is_not_rendered_at_the_truth(
     for number in numbers:
         values = values_of(corpus, own, number, levels)
         light, gain = rendered(chain, own.traced, values), chain.gain(values)
+        known_light = rendered(chain, own.traced, values, rounded=True)
         for frames in (1, 100):
             if frames == 1:
                 seen = stored(own, corpus, number, levels)
             else:
                 seen = averaged(own, corpus, number, levels, frames, 0)
             for known in (False, True):
-                told = light + known * rounding(chain.design, light, np.array(gain))
+                told = known_light if known else light
                 noise = covariance(chain, features, light, gain, frames, rounded=known)
                 left = (features(seen[None]) - features(told[None]))[0].astype(np.float64)
                 share = left @ np.linalg.solve(noise, left) / len(left)
