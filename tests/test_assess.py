@@ -102,6 +102,22 @@ def test_means_of_some_of_the_samples_are_told_of_these(tmp_path: Any) -> None:
     assert "mean of 100" not in assessing_report.write(tmp_path).read_text(encoding="utf-8")
 
 
+def test_single_exposures_and_means_are_asked_of_the_first() -> None:
+    """`--single` and `--averaged`."""
+    assert [assessing.asked(3, *most) for most in ((None, None), (0, None), (3, None), (4, None))] == [
+        (1, 100),
+        (100,),
+        (100,),
+        (1, 100),
+    ]
+    assert [assessing.asked(3, *most) for most in ((None, 0), (4, 3), (3, 4), (3, 3))] == [
+        (1,),
+        (1,),
+        (100,),
+        (),
+    ]
+
+
 def test_means_alone(tmp_path: Any) -> None:
     """`--single 0`: nothing is said of one exposure."""
     means = rows()

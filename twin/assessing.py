@@ -110,9 +110,7 @@ def assess(
     _claim(folder, told)
     tasks = []
     for place, number in enumerate(numbers):
-        asked = zip(FRAMES, (single, averaged), strict=True)
-        exposures = tuple(frames for frames, most in asked if most is None or place < most)
-        if exposures:
+        if exposures := asked(place, single, averaged):
             kept = folder / SAMPLES / f"{number:06d}.json"
             parts = (str(model), str(corpus), number, kept, rendered, seed)
             tasks.append(Task(*parts, exposures, as_trained))
@@ -133,6 +131,12 @@ def assess(
     draw(drawn, estimator.prior.ranges, tissue_kPa, folder / PICTURE)
     assessing_report.write(folder)
     return record
+
+
+def asked(place: int, single: int | None, averaged: int | None) -> tuple[int, ...]:
+    """Return how many exposures a sample is answered from, each; of so many samples at most; None for all."""
+    limits = zip(FRAMES, (single, averaged), strict=True)
+    return tuple(frames for frames, most in limits if most is None or place < most)
 
 
 def levels_of(source: Corpus, estimator: Estimator) -> list[int]:

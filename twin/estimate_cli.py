@@ -83,9 +83,9 @@ def _assess(arguments: argparse.Namespace) -> int:
             ("--quick", arguments.quick),
             ("--as-trained", arguments.as_trained),
             ("--workers", arguments.workers),
-            ("--seed", arguments.seed),
+            ("--seed", arguments.seed or None),
         ):
-            if given:
+            if given is not None and given is not False:
                 raise DesignError(
                     flag,
                     "it with --curve",

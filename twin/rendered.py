@@ -82,7 +82,7 @@ def rendered(
             pair.append(retake.average(whole_blocks(pixels, block), block))
         found.append(pair)
     seen = np.asarray(found, np.float32)
-    return seen + rounding(design, seen, np.array(gain)) if rounded and quick else seen
+    return seen + rounding(chain.design, seen, np.array(gain)) if rounded and quick else seen
 
 
 def coarser(design: Design) -> tuple[Design, int]:

@@ -6,9 +6,10 @@ Its paths are noise that no camera has, so what they make of a block of pixels i
 and put into the fit: posteriors are as wide as that asks for. All pictures of a pass follow the same random
 choices, which takes most of it out of what inclusions change, and press and sensor are alike in their four
 quarters, so that pictures are folded. A pass of two phantoms takes a minute of a core; passes are kept in
-TWIN_KEPT, and TWIN_PASSES asks for more.
+TWIN_KEPT for this design, its light and mechanics, and TWIN_PASSES asks for more.
 """
 
+import hashlib
 import os
 import time
 from pathlib import Path
@@ -24,6 +25,8 @@ from scipy.ndimage import uniform_filter
 import fem
 from estimation.features import Features
 from estimation.posterior import REFERENCE_FRAMES
+from fem import solving
+from scenes.traced import LIGHT
 from twin import presses, rendered, retake
 from twin.chain import BLOCK, Chain, whole_blocks
 from twin.design import Design
@@ -53,7 +56,9 @@ def estimator() -> Estimator:
 @pytest.fixture(scope="module")
 def passes(estimator: Estimator) -> Floats:
     """Charges of blocks (passes, phantoms, levels, 2, r, c), electrons, each of its own random choices."""
-    design, kept = estimator.chain.design, Path(os.environ["TWIN_KEPT"])
+    design = estimator.chain.design
+    made = repr((design, PHANTOMS, PATHS, LIGHT, solving._FORMAT))
+    kept = Path(os.environ["TWIN_KEPT"]) / hashlib.sha256(made.encode()).hexdigest()[:16]
     four = {(side, design.leds[0].flux_W) for side in ("+x", "-x", "+y", "-y")}
     assert {(led.side, led.flux_W) for led in design.leds} == four, "for pictures of four quarters alike"
     kept.mkdir(parents=True, exist_ok=True)
