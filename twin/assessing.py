@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import fem
+from scenes.sensor import NotModelled
 from twin import ablation, assessing_report
 from twin.assess import FRAMES, averaged, stored, summed_up
 from twin.assessment import METHODS, SHORT, answered, record_of
@@ -104,7 +105,7 @@ def assess(
         "model": estimator.card["sha256"],
         "corpus": source.plan.digest,
         "seed": seed,
-        "format": 1,
+        "format": 2,
         **({"as_trained": True} if as_trained else {}),
     }
     _claim(folder, told)
@@ -253,7 +254,7 @@ def answer(task: Task) -> None:
         with suppress(fem.NotModelled):
             parts = ablation.bounds(estimator.chain, estimator.prior, values)
             row["parts"] = {name: sd.tolist() for name, sd in parts.items()}
-    begin, start = None, None
+    begin, start, more = None, None, None
     for frames in (count for count in task.exposures if str(count) not in row):
         if frames == 1:
             seen = stored(estimator, source, task.number, levels)
@@ -267,14 +268,16 @@ def answer(task: Task) -> None:
             row.setdefault("quick", []).append(str(frames))
         if blank:
             continue
-        truth = np.array([row["truth"]])
+        truth, rendered = np.array([row["truth"]]), task.rendered and bool(estimator.traced)
         found["network"] = found["rendered"] = _short(drawn, truth)
         try:
-            least, found["deflection"] = estimator.limits(values, frames)
+            if more is None:
+                more = estimator.more_along_valley(values, threads=1) if rendered else 0.0
+            least, found["deflection"] = estimator.limits(values, frames, more)
             found["bound"] = np.sqrt(np.diag(least)[: len(NAMES)]).tolist()
-        except fem.NotModelled:
+        except (fem.NotModelled, NotModelled):
             found["bound"] = found["deflection"] = None
-        if task.rendered and estimator.traced:
+        if rendered:
             begins = drawn.mean(axis=0) if start is None else start
             refined = estimator.refined(
                 seen, frames, begins, samples=_DRAWS, seed=task.seed, begin=begin, threads=1

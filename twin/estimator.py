@@ -17,10 +17,11 @@ from scenes.sensor import NotModelled
 from scenes.traced import TracedLight
 from twin import likeness
 from twin.block_noise import mean_variance
+from twin.bounding import limits, more_along_valley
 from twin.chain import BLOCK, Chain, whole_blocks
 from twin.discrepancy import Discrepancy
 from twin.estimates import NAMES, Estimate
-from twin.fitting import Fitted, Prior, fit, limits, reachable
+from twin.fitting import Fitted, Prior, fit, reachable
 from twin.presence import presence
 from twin.put_back import put_back, where
 from twin.received import Received
@@ -228,10 +229,27 @@ class Estimator:
         low, high = self.prior.ranges.T
         return np.asarray(low + (high - low) * unit)
 
-    def limits(self, values: Mapping[str, float], frames: float) -> tuple[NDArray[np.float64], float]:
-        """Return the bound and the deflection at true values; see `fitting.limits`."""
+    def limits(
+        self, values: Mapping[str, float], frames: float, more: NDArray[np.float64] | float = 0.0
+    ) -> tuple[NDArray[np.float64], float]:
+        """Return the bound and the deflection at true values; see `bounding.limits`."""
         sight = self.sight
-        return limits(self.chain, sight.features, self.prior, values, frames, sight.off)
+        return limits(self.chain, sight.features, self.prior, values, frames, sight.off, more)
+
+    def more_along_valley(
+        self, values: Mapping[str, float], *, threads: int | None = None
+    ) -> NDArray[np.float64]:
+        """Return (k,) what the bound of rendered pictures wants; see `bounding.more_along_valley`.
+
+        Raises `fem.NotModelled` and `scenes.sensor.NotModelled` where pictures cannot be rendered.
+        """
+
+        def pictures(at: Mapping[str, float]) -> Single:
+            return render(
+                self.chain, self.traced, reachable(self.chain, dict(at)), threads=threads, quick=True
+            )
+
+        return more_along_valley(self.chain, self.sight.features, self.prior, values, pictures)
 
     def fitted(self, seen: Single, frames: float, start: NDArray[np.floating]) -> Fitted:
         """Return the most probable specimen by the chain, for coarse counts (levels, 2, r, c), from a start

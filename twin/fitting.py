@@ -1,4 +1,4 @@
-"""The model-based estimator: the most probable specimen by the chain, and the bound from the same chain.
+"""The model-based estimator: the most probable specimen by the chain.
 
 Pictures are features (`estimation.features`) with normal noise; what is not known has a normal prior, the
 inclusion's that of a uniform draw from its ranges. Gauss-Newton steps, bent along the valley
@@ -8,7 +8,7 @@ central differences.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -369,31 +369,3 @@ def inside(prior: Prior, x: Floats) -> Floats:
     inner[:5] = np.clip(x[:5], prior.ranges[:, 0], prior.ranges[:, 1])
     inner[5:] = np.clip(x[5:], -4.0, 4.0)
     return inner
-
-
-def limits(
-    chain: Chain,
-    features: Features,
-    prior: Prior,
-    values: Mapping[str, float],
-    frames: float,
-    off: Callable[[NDArray[np.floating]], Floats | float] = lambda pictures: 0.0,
-) -> tuple[Floats, float]:
-    """Return the prior-included bound (5 + q, 5 + q) at true values, (J C⁻¹ Jᵀ + P)⁻¹, and the deflection d'
-    with which an ideal observer tells the inclusion from none (see `estimation.detection`).
-
-    ``off`` tells the covariance (k, k) of what features of pictures (levels, 2, r, c) are off by, besides
-    noise.
-
-    Raises `fem.NotModelled` where the chain cannot go.
-    """
-    x = prior.unknowns(values)
-    seen, slopes = jacobian(chain, features, prior, x)
-    gain = chain.gain(prior.values(x))
-    noise = covariance(chain, features, seen, gain, frames, rounded=True) + off(seen)
-    told = slopes @ np.linalg.solve(noise, slopes.T)
-    without = np.stack([seen[:, 1], seen[:, 1]], axis=1)
-    signal = (features(seen[None])[0] - features(without[None])[0]).astype(np.float64)
-    nuisance = slopes[5:]
-    least = signal @ np.linalg.solve(noise + nuisance.T @ nuisance, signal)
-    return np.asarray(np.linalg.inv(told + prior.precision)), float(np.sqrt(max(least, 0.0)))

@@ -18,12 +18,13 @@ import fem
 from twin import assessing_report
 from twin.assess import LEAST_MM, stored
 from twin.assessing import KEPT, free, levels_of, values_of
+from twin.bounding import limits
 from twin.complaint import DesignError, shown
 from twin.corpus import Corpus
 from twin.estimates import NAMES
 from twin.estimator import Estimator
 from twin.estimator_file import load_estimator
-from twin.fitting import fit, limits
+from twin.fitting import fit
 from twin.report import BLUE, GREY, RED, panels, write_json
 from twin.stage import usable
 from twin.train import Seen, gather, learn_light, of_levels

@@ -21,7 +21,7 @@ from twin.complaint import DesignError
 from twin.estimates import NAMES
 from twin.estimator import Estimator, black
 from twin.estimator_file import load_estimator
-from twin.fitting import covariance
+from twin.fitting import covariance, differences
 from twin.received import Received
 from twin.rendered import rendered
 from twin.sound import check_exposure, check_pair
@@ -133,6 +133,33 @@ def test_noise_alone_explains_what_is_not_rendered_at_the_truth(
         )
     for frames in (1, 100):
         assert abs(np.mean(found[frames, True]) - 1.0) < 4.0 * spread
+
+
+@pytest.mark.timeout(3600)
+def test_two_rendered_pictures_make_the_bound_right(estimator: Estimator, corpus: twin.Corpus) -> None:
+    """Against the bound with each derivative rendered, of means of 100; two minutes an inclusion."""
+    own = replace(estimator, calibration=None)
+    chain, features, prior = own.chain, own.sight.features, own.prior
+    levels, mapped, made = levels_of(corpus, own), [], []
+    for number in held_out(corpus):
+        true = truth(corpus, number)
+        if true is None or true[0] < 4.0:
+            continue
+        values = values_of(corpus, own, number, levels)
+        ends, apart = differences(prior, prior.unknowns(values))
+        seen = np.stack([rendered(chain, own.traced, prior.values(end), rounded=True) for end in ends])
+        told = features(seen).astype(np.float64)
+        slopes = (told[1::2] - told[::2]) / apart[:, None]
+        light = rendered(chain, own.traced, values)
+        noise = covariance(chain, features, light, chain.gain(values), 100, rounded=True)
+        least = np.linalg.inv(slopes @ np.linalg.solve(noise, slopes.T) + prior.precision)
+        right = np.sqrt(np.diag(least)[: len(NAMES)])
+        for more, found in ((0.0, mapped), (own.more_along_valley(values), made)):
+            found.append(np.sqrt(np.diag(own.limits(values, 100, more)[0])[: len(NAMES)]) / right)
+        print(number, true.round(2), right.round(4), mapped[-1].round(3), made[-1].round(3), flush=True)
+        if len(made) == ANSWERED // 2:
+            break
+    assert np.all(np.abs(np.array(made) - 1.0) < 0.06)
 
 
 @pytest.mark.timeout(3600)
