@@ -243,7 +243,7 @@ def test_a_good_map_needs_no_rendering(modulus: float, monkeypatch: pytest.Monke
 
 
 def test_a_start_beside_the_end_of_a_range_is_no_place_to_stay() -> None:
-    """The first step would go over the end and is cut to nothing: that is not where the fit ends."""
+    """The first step would go over the end: all else goes on from there."""
     features: Any = Features()
     x = np.array([7.0, 4.0, 100.0, 0.1, 0.0, 0.0])
     start = np.array([6.5, 4.0 + 1e-7, 70.0, 0.4, 0.3, 0.0])
@@ -256,17 +256,17 @@ def test_a_start_beside_the_end_of_a_range_is_no_place_to_stay() -> None:
 
 @pytest.mark.parametrize("along", [True, False])
 def test_a_fit_goes_along_a_thin_bent_valley(along: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """From 115 kPa to 45 in seven steps, by pictures with a hundredth of an exposure's noise; straight steps,
+    """From 115 kPa to 45 in five steps, by pictures with a hundredth of an exposure's noise; straight steps,
     or some share of them, leave the valley, and it takes more."""
     monkeypatch.setitem(globals(), "light_map", truth)
-    monkeypatch.setattr(fitting, "_MOST", 7)
+    monkeypatch.setattr(fitting, "_MOST", 5)
     if not along:
         monkeypatch.setattr(fitting, "bent", lambda x, step, moduli_kPa, tissue_kPa: x + step)
     x = np.array([8.0, 6.0, 45.0, 0.3, -0.2, 0.0])
     start, features = x.copy(), Features()
     start[[0, 2]] = 6.33, 115.0  # as much d³ contrast
     found = fitting.fit(CHAIN, features, PRIOR, light_map(x), 1e4, start)  # type: ignore[arg-type]
-    assert (abs(found.x[2] - 45.0) < 0.5) == along, found.x
+    assert (abs(found.x[2] - 45.0) < 0.1) == along, found.x
 
 
 @pytest.mark.parametrize("depth", [11.9, 12.0 - 1e-5])

@@ -13,6 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+from scipy.optimize import lsq_linear
 
 from estimation.alignment import moved
 from estimation.features import Features
@@ -34,7 +36,6 @@ _MOST = 12  # Gauss-Newton steps
 _DONE = 0.01  # step in standard deviations that ends them
 _SHARES = (1.0, 0.5, 0.2, 0.05)  # of a step that are tried
 _NOTHING = 1e-9  # of a number's spread: rounding
-_AT_END = 1e-9  # of a range: no nearer to its end is told from being there
 
 
 @dataclass(frozen=True)
@@ -302,12 +303,12 @@ def fit(
         information = slopes @ weighted + precision
         slope = weighted.T @ rest - precision @ (x - prior.middle)
         free = np.arange(len(x)) >= held
-        step, cut = step_inside(prior, x, information, slope, free)
+        step = step_inside(prior, x, information, slope, free)
         inverse = np.linalg.inv(information)
         inverse = 0.5 * (inverse + inverse.T)  # even but for rounding, which who draws from it would see
         found = Fitted(x, inverse, float(rest @ np.linalg.solve(noise, rest)), seen)
         size = np.abs(step) / np.sqrt(np.diag(inverse))
-        if size.max() < _DONE and not cut:
+        if size.max() < _DONE:
             break
         tried = [inside(prior, bent(x, share * step, prior.ranges[2], tissue_kPa)) for share in _SHARES]
         best = _likeliest(chain, features, prior, [x, *tried], observed, noise, near)
@@ -320,30 +321,21 @@ def fit(
 
 def step_inside(
     prior: Prior, x: Floats, information: Floats, slope: Floats, free: NDArray[np.bool_]
-) -> tuple[Floats, bool]:
-    """Return the step of Gauss and Newton to the best place that lies within the prior's ranges, and whether
-    it is cut short; what is not free (5 + q,) stays.
+) -> Floats:
+    """Return the step of Gauss and Newton to the best place within the prior's ranges; what is not free
+    (5 + q,) stays.
 
-    What is at the end of its range and wants to go on is held, and the others go where they are best then;
-    the step ends where the next one comes to its end.
+    What comes to the end of its range is left there, and the others go where they are best then (Stark and
+    Parker 1995; [stark1995]). Were the step cut short there, all else would stand still, too.
     """
-    low, high = prior.ranges.T
-    tiny, free = _AT_END * (high - low), free.copy()
+    ends = np.tile([[-np.inf], [np.inf]], len(x))
+    ends[:, : len(PARAMETERS)] = prior.ranges.T - x[: len(PARAMETERS)]
+    free = free & (ends[0] < ends[1])
+    root = np.linalg.cholesky(information[np.ix_(free, free)])
+    ahead = solve_triangular(root, slope[free], lower=True)
     step = np.zeros(len(x))
-    for _ in range(len(low) + 1):
-        step[:] = 0.0
-        step[free] = np.linalg.solve(information[np.ix_(free, free)], slope[free])
-        ahead = x[:5] + step[:5]
-        at_low, at_high = x[:5] <= low + tiny, x[:5] >= high - tiny
-        stuck = free[:5] & ((at_low & (ahead < low)) | (at_high & (ahead > high)))
-        if not stuck.any():
-            break
-        free[:5] &= ~stuck
-    ends = np.where(step[:5] > 0.0, high, low) - x[:5]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        shares = np.where(step[:5] != 0.0, ends / step[:5], np.inf)
-    share = min(1.0, float(shares.min()))
-    return np.asarray(step * share), share < 1.0
+    step[free] = lsq_linear(root.T, ahead, ends[:, free], method="bvls").x
+    return step
 
 
 def _likeliest(

@@ -267,8 +267,8 @@ def _held(
         # the ranges are flat; their normal stand-in only bounds what the pictures do not tell
         log_density = -0.5 * cost + 0.5 * float(np.linalg.slogdet(inverse)[1])
         least, best = cost, _Node(x, log_density, inverse[:4, :4], near)
-        step, cut = step_inside(prior, x, information, weighted.T @ away - pull, free)
-        if not cut and np.abs(step[rest] / np.sqrt(np.diag(inverse)))[:4].max() < STILL:
+        step = step_inside(prior, x, information, weighted.T @ away - pull, free)
+        if np.abs(step[rest] / np.sqrt(np.diag(inverse)))[:4].max() < STILL:
             break
         x = inside(prior, x + step)
     assert best is not None

@@ -21,7 +21,7 @@ from twin.complaint import DesignError
 from twin.estimates import NAMES
 from twin.estimator import Estimator, black
 from twin.estimator_file import load_estimator
-from twin.fitting import covariance, differences
+from twin.fitting import covariance, differences, jacobian
 from twin.received import Received
 from twin.rendered import rendered
 from twin.sound import check_exposure, check_pair
@@ -160,6 +160,48 @@ def test_two_rendered_pictures_make_the_bound_right(estimator: Estimator, corpus
         if len(made) == ANSWERED // 2:
             break
     assert np.all(np.abs(np.array(made) - 1.0) < 0.06)
+
+
+@pytest.mark.timeout(3600)
+def test_fits_to_means_find_what_is_most_probable_to_first_order_at_the_truth(
+    estimator: Estimator, corpus: twin.Corpus
+) -> None:
+    """An answer that knows the truth and is one linear step from it, with what pictures change by along the
+    valley rendered: what noise moves it by, the fit is to be moved by, too. Half a minute an inclusion."""
+    own = replace(estimator, calibration=None)
+    chain, features, prior = own.chain, own.sight.features, own.prior
+    levels, found = levels_of(corpus, own), []
+    for number in held_out(corpus):
+        true = truth(corpus, number)
+        if true is None or true[0] < 5.0 or not 50.0 < true[2] < 100.0:  # ends of the ranges bend answers
+            continue
+        values = values_of(corpus, own, number, levels)
+        x = prior.unknowns(values)
+        seen = averaged(own, corpus, number, levels, 100, 0)
+        light = rendered(chain, own.traced, values, rounded=True)
+        _, slopes = jacobian(chain, features, prior, x)
+        slopes[2] += own.more_along_valley(values)
+        noise = covariance(chain, features, light, chain.gain(values), 100, rounded=True)
+        weighted = np.linalg.solve(noise, slopes.T).T
+        bound = np.linalg.inv(weighted @ slopes.T + prior.precision)
+        left = (features(seen[None]) - features(light[None]))[0].astype(np.float64)
+        step = (bound @ (weighted @ left - prior.precision @ (x - prior.middle)))[: len(NAMES)]
+        start = own.unscaled(own.network.sample(features(seen[None]), 100, 1000, 0)[0]).mean(axis=0)
+        told = own.refined(seen, 100, start)
+        assert told is not None and told.explains
+        drawn = told.samples[:, : len(NAMES)]
+        spread = drawn.std(axis=0)
+        found.append((step / spread, (drawn.mean(axis=0) - true) / spread))
+        print(number, true.round(2), *(one.round(2) for one in found[-1]), flush=True)
+        if len(found) == 2 * ANSWERED:
+            break
+    first, fits = np.array(found).swapaxes(0, 1)
+    apart = np.sqrt(np.mean((fits - first) ** 2, axis=0))
+    print(
+        f"{len(found)} inclusions: fits are {apart.round(3)} sd from first order rms, "
+        f"{np.sqrt(np.mean(fits**2, axis=0)).round(2)} from the truth"
+    )
+    assert np.all(apart < 0.25)
 
 
 @pytest.mark.timeout(3600)
