@@ -167,7 +167,8 @@ def test_fits_to_means_find_what_is_most_probable_to_first_order_at_the_truth(
     estimator: Estimator, corpus: twin.Corpus
 ) -> None:
     """An answer that knows the truth and is one linear step from it, with what pictures change by along the
-    valley rendered: what noise moves it by, the fit is to be moved by, too. Half a minute an inclusion."""
+    valley rendered: what noise moves it by, the fit is to be moved by, too. Moduli are compared by -1/E, in
+    which the valley is even. Half a minute an inclusion."""
     own = replace(estimator, calibration=None)
     chain, features, prior = own.chain, own.sight.features, own.prior
     levels, found = levels_of(corpus, own), []
@@ -189,9 +190,11 @@ def test_fits_to_means_find_what_is_most_probable_to_first_order_at_the_truth(
         start = own.unscaled(own.network.sample(features(seen[None]), 100, 1000, 0)[0]).mean(axis=0)
         told = own.refined(seen, 100, start)
         assert told is not None and told.explains
-        drawn = told.samples[:, : len(NAMES)]
+        drawn, even = told.samples[:, : len(NAMES)].copy(), true.copy()
+        step[2] /= true[2] ** 2
+        drawn[:, 2], even[2] = -1.0 / drawn[:, 2], -1.0 / true[2]
         spread = drawn.std(axis=0)
-        found.append((step / spread, (drawn.mean(axis=0) - true) / spread))
+        found.append((step / spread, (drawn.mean(axis=0) - even) / spread))
         print(number, true.round(2), *(one.round(2) for one in found[-1]), flush=True)
         if len(found) == 2 * ANSWERED:
             break
