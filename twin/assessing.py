@@ -200,7 +200,7 @@ def _claim(folder: Path, told: Mapping[str, Any]) -> None:
             except ValueError:  # cut off, or no text at all
                 same = False
             if not same:
-                allowed = "a new folder, or that of the same model, corpus and seed"
+                allowed = "a new folder, or that of the same model, corpus, seed and version"
                 raise DesignError("--out", shown(str(folder)), allowed)
             return
         if not free(folder):

@@ -69,7 +69,7 @@ def more_along_valley(
     all else follows the valley at true values.
 
     As a correction of the derivative by modulus alone it makes the one along the valley right; derivatives
-    across it, by size and depth, stay the chain's.
+    across it, by size and depth, stay the chain's. Zero where the valley leaves the ranges on both sides.
 
     Parameters
     ----------

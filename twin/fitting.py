@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 from scipy.optimize import lsq_linear
 
 from estimation.alignment import moved
@@ -331,10 +330,13 @@ def step_inside(
     ends = np.tile([[-np.inf], [np.inf]], len(x))
     ends[:, : len(PARAMETERS)] = prior.ranges.T - x[: len(PARAMETERS)]
     free = free & (ends[0] < ends[1])
-    root = np.linalg.cholesky(information[np.ix_(free, free)])
-    ahead = solve_triangular(root, slope[free], lower=True)
+    scale = 1.0 / np.sqrt(np.diag(information)[free])
+    # by parts, of which rounding may leave the least below nothing where many exposures tell much
+    told, parts = np.linalg.eigh(scale[:, None] * information[np.ix_(free, free)] * scale)
+    root = np.sqrt(np.maximum(told, np.finfo(float).eps * told[-1]))
+    ahead = parts.T @ (scale * slope[free]) / root
     step = np.zeros(len(x))
-    step[free] = lsq_linear(root.T, ahead, ends[:, free], method="bvls").x
+    step[free] = scale * lsq_linear(root[:, None] * parts.T, ahead, ends[:, free] / scale, method="bvls").x
     return step
 
 
