@@ -161,7 +161,7 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path: Any) -> None:
     told = {"model": "a", "corpus": "b", "seed": 0, "format": 1}
     assessing._claim(tmp_path / "new", told)
     assessing._claim(tmp_path / "new", told)
-    with pytest.raises(DesignError, match="same model, corpus and seed"):
+    with pytest.raises(DesignError, match="same model, corpus, seed and version"):
         assessing._claim(tmp_path / "new", told | {"seed": 1})
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "letter.txt").write_text("dear")
@@ -177,7 +177,7 @@ def test_a_place_that_is_no_folder_is_refused_in_one_line(tmp_path: Path) -> Non
             assessing._claim(tmp_path / out, told)
     assessing._claim(tmp_path / "cut", told)
     (tmp_path / "cut" / assessing.SAMPLES / "head.json").write_bytes(b"{")
-    with pytest.raises(DesignError, match=r"--out: .*same model, corpus and seed"):
+    with pytest.raises(DesignError, match=r"--out: .*same model, corpus, seed and version"):
         assessing._claim(tmp_path / "cut", told)
 
 
