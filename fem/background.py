@@ -28,7 +28,7 @@ from fem.mesh import QUALITIES, Geometry
 from fem.model import NotModelled, Probe, Slab
 from fem.pressing import Press
 from fem.ripples import DEGREE, expanded, without_ripples
-from fem.spheres import refuse
+from fem.spheres import multipoles, refuse
 from fem.tared import added, tared
 from fem.topology import Resolution
 
@@ -124,8 +124,9 @@ def _smooth(
     if ball is None:
         return list(signals)
     assert small is not None  # of all flat probes
-    tissue = "preview" if res == QUALITIES["preview"] else "standard"
-    true = expanded(geometry.probe, geometry.slab, ball, [ball.modulus], DEGREE, to, tissue)
+    quality = "preview" if res == QUALITIES["preview"] else "standard"
+    tissue = multipoles(geometry.probe, geometry.slab, quality, degree=DEGREE)
+    true = expanded(tissue, ball, [ball.modulus], to)
     rough = _carried(tared(geometry, small), lines(first.surface), to)
     whole = [
         without_ripples(np.stack(levels), near, fine[0], to)

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from fem.emulator import CENTRED, Emulator, amplitudes, features, lagrange, resample
 from fem.emulator_errors import Errors, off_the_edge
 from fem.regression import Regression, regress
-from fem.sampling import NotBuilt, Plan, contrast, geometry_at
+from fem.sampling import NotBuilt, Plan, contrast
 from fem.solver import one_thread
-from fem.solving import KNOTS, STRETCHED, Progress, knots, run, solved, tally
+from fem.solving import KNOTS, Progress, knots, run, solved, tally
+from fem.specimen import geometry_at
 from fem.surface import line_weights
 from fem.symmetry import unfold
 from fem.topology import Resolution
@@ -35,7 +36,7 @@ _NAMES = {
     "stretched_pair": "pairs of meshes at finite strain",
 }
 _LEAST = 12  # samples at finite strain that the learning curve begins with
-_HELD = 3  # one in so many of the samples with both offsets is what the learning curve is measured on
+_HELD = 3  # one in so many of the tissues is what the learning curve is measured on, with both offsets
 _IMAGES = 0.5  # how far beyond the symmetry planes images of the samples are learned, in largest offsets
 
 
@@ -174,7 +175,7 @@ def fit(plan: Plan, folder: str | Path, samples: int | None = None) -> Emulator:
     place = Path(folder)
     kinds = [("sample", samples), ("pair", None)]
     if plan.finite:
-        kinds.append(("stretch", None if samples is None else -(-samples // STRETCHED)))
+        kinds.append(("stretch", samples))
         kinds.append(("stretched_pair", None))
     read = [_read(plan, place, *kind) for kind in kinds]
     more, pairs_more = read[2:] if plan.finite else (None, None)
@@ -207,7 +208,7 @@ def _cross_validated(known: _Known, fits: _Fits, gains: list[Pair], solves: Floa
     for k in range(_FOLDS):
 
         def held(number: NDArray[np.int64], k: int = k) -> NDArray[np.bool_]:
-            return np.asarray(number % _FOLDS == k)
+            return np.asarray(number // known.samples.plan.shared % _FOLDS == k)  # with all of its tissue
 
         fold = held(last.number)
         found[fold] = _errors(known, _fit(known.without(held), fits.lengths), last.number[fold])
@@ -367,10 +368,10 @@ def _missed(miss: Floats, true: Floats, x: Floats) -> tuple[float, float, float]
 def _curve(known: _Known) -> Floats:
     """Learning curve, as `Errors.curve`."""
     last = known.last
-    off = last.points[:, 3] > 0
-    held = last.number[off][_HELD - 1 :: _HELD]
-    test = last.number[last.typical & (last.points[:, 0] >= 4.0) & np.isin(last.number, held)]
-    kept = known.without(lambda number: np.isin(number, held))
+    tissues = last.number // last.plan.shared
+    some = np.unique(tissues[last.points[:, 3] > 0])[_HELD - 1 :: _HELD]
+    test = last.number[last.typical & (last.points[:, 0] >= 4.0) & np.isin(tissues, some)]
+    kept = known.without(lambda number: np.isin(number // last.plan.shared, some))
     rows = []
     for share in (0.125, 0.25, 0.5, 1.0):
         parts = [
@@ -381,8 +382,8 @@ def _curve(known: _Known) -> Floats:
         if solves[0] < _FEWEST["sample"] or (known.more is not None and solves[1] < _LEAST) or not len(test):
             continue
         assert parts[0] is not None
-        some = replace(kept, samples=parts[0], more=parts[1])
-        found = _errors(known, _fit(some, None), test)
+        fewer = replace(kept, samples=parts[0], more=parts[1])
+        found = _errors(known, _fit(fewer, None), test)
         found = found[np.isfinite(found).all(axis=1)]
         spent = sum(float(part.seconds.sum()) for part in parts if part is not None)
         rows.append([*solves, spent, *(np.percentile(found[:, k], p) for k in (0, 1, 2) for p in (50, 95))])

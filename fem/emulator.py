@@ -50,15 +50,15 @@ class Emulator:
     x
         Lines of the answers' grid along x and y, (m,) mm.
     pressure, moved
-        Background at the knots (i, j) of thickness and tissue, as `sampling.background` gives it; (i, j,
+        Background at the knots (i, j) of thickness and tissue, as `specimen.background` gives it; (i, j,
         ...).
     rise, tared
-        What the inclusion adds, as `sampling.solve` gives it, over `amplitudes`.
+        What the inclusion adds, as `specimen.solve` gives it, over `amplitudes`.
     finer, finer_tared
-        What a finer mesh adds to both, as `sampling.refine` gives it, over `amplitudes`.
+        What a finer mesh adds to both, as `specimen.refine` gives it, over `amplitudes`.
     rise_more, tared_more, finer_more, finer_tared_more
-        What finite strain adds, as `sampling.stretch` gives it, and what the finer mesh adds to that, as
-        `sampling.refine_stretch` does, over `amplitudes`; None for a linear one.
+        What finite strain adds, as `specimen.stretch` gives it, and what the finer mesh adds to that, as
+        `specimen.refine_stretch` does, over `amplitudes`; None for a linear one.
     errors
         From cross-validation.
     """

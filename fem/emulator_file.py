@@ -18,13 +18,14 @@ from numpy.typing import NDArray
 from fem.emulator import Emulator
 from fem.emulator_errors import Errors
 from fem.lines import logical_lines
-from fem.regression import Regression, groups
+from fem.regression import MATERN, SQUARED, Regression, groups
 from fem.sampling import PLAN, Plan
 from fem.solving import KNOTS
 
 Floats = NDArray[np.float64]
 
-_FORMAT = 7
+_FORMAT = 8
+_SQUARED = 7  # the format before, whose covariances are squared exponentials
 _LARGEST = 512 * 2**20  # bytes of all arrays
 _REGRESSIONS = ("rise", "tared", "finer", "finer_tared")
 _MORE = ("rise_more", "tared_more", "finer_more", "finer_tared_more")  # that finite strain has besides
@@ -64,8 +65,7 @@ def load_emulator(place: str | Path | BinaryIO) -> Emulator:
         Where there is no such file.
     """
     try:
-        arrays = _read(Path(place).read_bytes() if isinstance(place, str | Path) else place.read())
-        return _checked(arrays)
+        return _checked(_read(Path(place).read_bytes() if isinstance(place, str | Path) else place.read()))
     except (
         KeyError,
         TypeError,
@@ -93,9 +93,11 @@ def _read(data: bytes) -> dict[str, NDArray[Any]]:
     expected = {"head", *_GRIDS, *(f"errors.{f.name}" for f in fields(Errors))}
     expected |= {f"{name}.{f.name}" for name in _REGRESSIONS for f in fields(Regression)}
     more = {f"{name}.{f.name}" for name in _MORE for f in fields(Regression)}
+    orders = {name for name in expected | more if name.endswith(".order")}
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         found = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-        if set(found) not in (expected, expected | more) or len(archive.infolist()) != len(found):
+        allowed = expected, expected | more, expected - orders, (expected | more) - orders
+        if set(found) not in allowed or len(archive.infolist()) != len(found):
             raise ValueError("its arrays are not those of an emulator")
         if sum(info.file_size for info in found.values()) > _LARGEST:
             raise ValueError("it is too large")
@@ -112,9 +114,11 @@ def _read(data: bytes) -> dict[str, NDArray[Any]]:
 
 def _checked(arrays: dict[str, NDArray[Any]]) -> Emulator:
     number, _, text = arrays["head"].tobytes().partition(b"\n")
-    if number != b"%d" % _FORMAT:
-        raise ValueError(f"format {number[:20]!r}, known is {_FORMAT}")
+    if number not in (b"%d" % _FORMAT, b"%d" % _SQUARED):
+        raise ValueError(f"format {number[:20]!r}, known are {_SQUARED} and {_FORMAT}")
     plan = PLAN.validate_json(text)
+    if number == b"%d" % _SQUARED:
+        arrays |= {f"{name}.order": np.array(SQUARED) for name in _parts(plan)}
     if ("rise_more.inputs" in arrays) != plan.finite:
         raise ValueError("its arrays are not those of its mechanics")
     m, levels, moduli = len(arrays["x"]), len(plan.levels), len(plan.ratios)
@@ -148,6 +152,8 @@ def _shapes_of(arrays: dict[str, NDArray[Any]], name: str, q: int, values: int) 
     samples, modes = len(arrays[f"{name}.inputs"]), len(arrays[f"{name}.modes"])
     if not ((arrays[f"{name}.lengths"] > 0).all() and (arrays[f"{name}.noise"] > 0).all()):
         raise ValueError(f"{name}: lengths and noise are not positive")
+    if arrays[f"{name}.order"].tolist() not in (SQUARED, MATERN):
+        raise ValueError(f"{name}: the order of its covariances is not known")
     shapes = {
         "inputs": (samples, q),
         "lengths": (len(groups(modes)), q),
@@ -155,7 +161,7 @@ def _shapes_of(arrays: dict[str, NDArray[Any]], name: str, q: int, values: int) 
         "mean": (values,),
         "modes": (modes, values),
     }
-    shapes |= {"trend": (q + 1, modes), "weights": (samples, modes)}
+    shapes |= {"trend": (q + 1, modes), "weights": (samples, modes), "order": ()}
     return {f"{name}.{key}": shape for key, shape in shapes.items()}
 
 

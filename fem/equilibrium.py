@@ -316,10 +316,10 @@ def _step(
     """
     while True:
         matrices: Matrices = tangent
+        if damping > 0 and isinstance(tangent, Tangent):
+            matrices = tangent.damped(damping)
         if damping > _STRONGEST:
             matrices, renew = body.rest, True
-        elif damping > 0 and isinstance(tangent, Tangent):
-            matrices = tangent.stored.plus(damping, body.rest)
         try:
             found = _solve(body, start.model, sys, start.tie, matrices, load, renew)
             return found, min(damping, _STRONGEST)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -15,7 +16,10 @@ from fem.quadrature import DOFS, NODES, Quadrature
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-_CHUNK = 128  # element matrices made double at a time
+_CHUNK = 128  # element matrices made, or made double, at a time
+_HALF = 41  # rows of the first block that tangents are stored by
+
+Blocks = NDArray[np.floating]
 
 
 @dataclass(frozen=True)
@@ -39,34 +43,6 @@ class AtRest:
 
 
 @dataclass(frozen=True)
-class Stiffness:
-    """Element matrices (m, 81, 81)."""
-
-    matrices: NDArray[np.floating]
-
-    def __call__(self, elements: Ints) -> NDArray[np.floating]:
-        """Matrices of some elements."""
-        return self.matrices[elements]
-
-    def times(self, local: Floats) -> Floats:
-        """Products with unknowns (elements, 81); sums are double in any case."""
-        force = np.empty((*local.shape, 1))
-        for start in range(0, len(local), _CHUNK):
-            part = slice(start, start + _CHUNK)
-            some = self.matrices[part].astype(np.float64, copy=False)
-            np.matmul(some, local[part, :, None], out=force[part])
-        return force[..., 0]
-
-    def plus(self, share: float, other: AtRest) -> Stiffness:
-        """The sum with a share of others."""
-        found = self.matrices.copy()
-        for start in range(0, len(found), _CHUNK):
-            part = np.arange(start, min(start + _CHUNK, len(found)))
-            found[part] += np.float32(share) * other(part)
-        return Stiffness(found)
-
-
-@dataclass(frozen=True)
 class Tangent:
     """Tangent stiffness of deformed elements, in single precision.
 
@@ -78,31 +54,50 @@ class Tangent:
     bulk: Floats
     moved: Floats
     volume: Floats | None = None  # that pressures are taken from, instead of the displacements' own; (m, 4)
+    damping: float = 0.0  # share of the stiffness at rest that is added
 
     @cached_property
-    def stored(self) -> Stiffness:
-        """All of them."""
+    def stored(self) -> tuple[Blocks, Blocks, Blocks]:
+        """Of all matrices, which are symmetric, the blocks A (m, h, h), B (m, 81 - h, h) and C in
+        [[A, B^T], [B, C]]."""
         heap.trim()  # beside the factor, these are what a press takes most memory for
-        return Stiffness(self._made(None))
+        m, h, rest = self.quad.size, _HALF, DOFS - _HALF
+        shapes = (m, h, h), (m, rest, h), (m, rest, rest)
+        found = tuple(np.empty(shape, np.float32) for shape in shapes)
+        for part in _chunks(m):
+            made = self(np.arange(m)[part])
+            for kept, block in zip(found, (made[:, :h, :h], made[:, h:, :h], made[:, h:, h:]), strict=True):
+                kept[part] = block
+        return found  # type: ignore[return-value]
 
     def __call__(self, elements: Ints) -> NDArray[np.floating]:
         """Matrices (n, 81, 81) of some elements."""
-        return self.stored(elements) if "stored" in vars(self) else self._made(elements)
+        moduli, volume = (self.shear[elements], self.bulk[elements]), self.volume
+        volume = None if volume is None else volume[elements]
+        found = elasticity.stiffness(self.quad, *moduli, self.moved, elements, np.float32, volume)
+        if self.damping:
+            rest = elasticity.stiffness(self.quad, *moduli, elements=elements, dtype=np.float32)
+            found += np.float32(self.damping) * rest
+        return found
 
     def times(self, local: Floats) -> Floats:
-        """Products with unknowns (elements, 81)."""
-        return self.stored.times(local)
+        """Products with unknowns (elements, 81); sums are double in any case."""
+        force, h = np.empty((*local.shape, 1)), _HALF
+        for part in _chunks(len(local)):
+            a, b, c = (some[part].astype(np.float64, copy=False) for some in self.stored)
+            upper, lower = local[part, :h, None], local[part, h:, None]
+            force[part, :h] = a @ upper + b.transpose(0, 2, 1) @ lower
+            force[part, h:] = b @ upper + c @ lower
+        return force[..., 0]
 
     def let_go(self) -> None:
         """Keep no matrices, until the next product."""
         vars(self).pop("stored", None)
 
-    def _made(self, elements: Ints | None) -> NDArray[np.floating]:
-        shear, bulk, volume = self.shear, self.bulk, self.volume
-        if elements is not None:
-            shear, bulk = shear[elements], bulk[elements]
-            volume = None if volume is None else volume[elements]
-        return elasticity.stiffness(self.quad, shear, bulk, self.moved, elements, np.float32, volume)
+    def damped(self, share: float) -> Tangent:
+        """With a share of the stiffness at rest; what is stored of this one is let go of."""
+        self.let_go()
+        return replace(self, damping=share)
 
 
 @dataclass(frozen=True)
@@ -127,7 +122,11 @@ class Sheared:
         return found
 
 
-Matrices = AtRest | Tangent | Stiffness
+Matrices = AtRest | Tangent
+
+
+def _chunks(size: int) -> Iterator[slice]:
+    return (slice(start, start + _CHUNK) for start in range(0, size, _CHUNK))
 
 
 def product(matrices: Matrices, moved: Floats, model: Model) -> Floats:

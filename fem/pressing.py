@@ -23,7 +23,7 @@ from fem.path import path
 from fem.solver import one_thread
 from fem.tared import added, tared
 from fem.topology import Layout, Resolution, materials, probe_topology, slab_topology
-from fem.trust import discretisation_error
+from fem.trust import discretisation_error, on_coarser
 from fem.wrinkles import refuse_wrinkles
 
 Floats = NDArray[np.float64]
@@ -318,6 +318,7 @@ def _presses(
     first = geometries[0]
     try:
         with one_thread():
+            coarse = [on_coarser(g, res) if estimate else None for g in geometries]
             model = build(first, res, mechanics == "finite")
             bare = path(first, model, False)
             step("without inclusion")
@@ -326,8 +327,8 @@ def _presses(
             if estimate or flat:
                 for one in (bare, *paths):
                     one.rate()
-            for geometry, full in zip(geometries, paths, strict=True):
-                error = discretisation_error(geometry, res, full, bare) if estimate else np.nan
+            for geometry, full, other in zip(geometries, paths, coarse, strict=True):
+                error = discretisation_error(geometry, other, full, bare) if estimate else np.nan
                 small = (full.per_mm(), bare.per_mm()) if flat and geometry.inclusion else None
                 step("error estimate")
                 found: dict[float, Press] = {}

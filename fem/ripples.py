@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from fem.ground import carry
 from fem.ground import lines as lines_of
-from fem.model import Inclusion, Probe, Slab
-from fem.spheres import multipoles
+from fem.model import Inclusion
+from fem.spheres import Multipoles
 from fem.tared import added
 
 Floats = NDArray[np.float64]
@@ -29,15 +29,9 @@ _INNER = 0.9  # of the probe's half width, where it is learned how many times fi
 
 
 def expanded(
-    probe: Probe,
-    slab: Slab,
-    ball: Inclusion,
-    moduli: Sequence[float],
-    degree: int,
-    to: tuple[Floats, Floats],
-    quality: str = "standard",
+    tissue: Multipoles, ball: Inclusion, moduli: Sequence[float], to: tuple[Floats, Floats]
 ) -> tuple[Floats, Floats]:
-    """Spheres that differ in their modulus (kPa) at small strain, by multipoles of a quality's tissue.
+    """Spheres that differ in their modulus (kPa) at small strain, in plain tissue that is solved.
 
     Returns
     -------
@@ -49,7 +43,6 @@ def expanded(
     NotModelled, ValueError
         For what multipoles do not press, in one line.
     """
-    tissue = multipoles(probe, slab, quality, degree=degree)
     rises, moves, shape = [], [], (to[0].size, to[1].size)
     for (one,) in tissue.press_moduli(ball, moduli, [1.0]):
         own, (rise, moved) = lines_of(one.surface), added(one.surface, 1.0, 1.0)

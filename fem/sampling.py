@@ -1,25 +1,6 @@
-"""The solves that an emulator learns from: which ones, and what is kept of each.
+"""Which specimens an emulator learns from: its ranges, and points within them that come in an order.
 
-Everything scales with the tissue's modulus, so the inclusion's enters as the contrast c with it. A sphere's
-signal goes as s = (c - 1) / (c + 1.5) (Eshelby 1957; [eshelby1957]); what is left of c after that is a
-polynomial in s through few nodes, and all of them share one factor at small strain.
-
-Finite strain costs many times more, and adds some per cent to the signal that depend little on the mesh: it
-is learned apart, as the difference that it makes on a coarse mesh, from fewer specimens with one modulus
-each. All press levels lie on one way down; between them and small strain, which is level 0, the answers per
-mm are a polynomial in the indentation.
-
-What a mesh of standard quality adds to either is smoother still, and learned from a few centred specimens.
-
-Meshes that follow the inclusion leave ripples in what it adds: a per cent or two of it, which change with its
-size and depth, and tell these from its modulus better than the press itself does. So small strain is told by
-multipoles in plain tissue, whose mesh stays, wherever these reach (`fem.spheres`); and since finite strain
-makes of the mesh's error what it makes of the signal, so many times the error at small strain is taken from
-what finite strain adds (a control variate).
-
-Contact pressures are kept as their *rise* over the tissue without inclusion, on the same mesh and at the same
-level: next to the probe's edge both follow the same singularity, and so does their discretisation error. In
-the rise both cancel.
+What is solved of each, and kept, is in `fem.specimen`.
 """
 
 from __future__ import annotations
@@ -36,19 +17,10 @@ from pydantic.dataclasses import dataclass
 from scipy.stats import qmc
 
 from fem import mesh
-from fem.ground import bare_geometry, cubic, ground
-from fem.ground import lines as grid_lines
-from fem.lines import lines, logical_lines
-from fem.mesh import Geometry
-from fem.meshed import build
-from fem.model import Inclusion, Length, Poisson, Probe, Slab, check
-from fem.path import path
-from fem.ripples import DEGREE, expanded, without_ripples
-from fem.solver import one_thread
+from fem.model import Inclusion, Length, Poisson, Probe, Slab
+from fem.ripples import DEGREE
 from fem.spheres import refuse
-from fem.tared import tared, tared_at_rest
 from fem.topology import Resolution
-from fem.wrinkles import refuse_wrinkles
 
 Floats = NDArray[np.float64]
 Some = TypeVar("Some", float, Floats)
@@ -59,6 +31,9 @@ _OFFSETS = (1, 1), (0, 0), (1, 0), (0, 0)  # which of its offsets each point of 
 CLEARANCE = 4.0
 """Least distance between inclusion and chest wall, mm."""
 _RAREST = 4096  # of so many specimens drawn one fits at least, or there are none to be had
+_MISSED = 256  # drawings none of which fits into a tissue, after which another one is taken
+_SHARED = 12  # specimens in a row in one plain tissue, which multipoles solve once for all
+_STRETCHED = 3  # samples for each one that is solved at finite strain, too
 
 LEAN = Resolution(arc=3, core=1, shell=3, above=3, below=1, edge=2, side=3, layer=1, backing=1)
 """Mesh of the samples. Its rise differs from 115 thousand unknowns in a quarter by what
@@ -182,10 +157,23 @@ class Plan:
             float(contrast(np.array(self.ranges.modulus_kPa[1] / soft))),
         )
 
+    @property
+    def shared(self) -> int:
+        """How many points in a row differ in their inclusion alone. Signals depend on thickness and tissue
+        so smoothly that few of these tell as much as one of each for every inclusion."""
+        return _SHARED if self.degree else 1
+
+    def stretched(self, number: int) -> bool:
+        """Whether a point is solved at finite strain, too: of a tissue's the first ones, of each kind of
+        offsets one."""
+        turn = number % self.shared
+        return turn < _SHARED // _STRETCHED if self.degree else number % _STRETCHED == 0
+
     def points(self) -> Iterator[Floats]:
         """Scrambled Sobol sequence of (size, depth, offsets x >= y >= 0, thickness, tissue, s), those that
         fit; s is that of the inclusion where one modulus is solved. Of four points one keeps its offsets, one
         keeps x, and two lie under the probe's middle: symmetry makes these two and five times cheaper.
+        So many in a row as are `shared` lie in one tissue.
 
         Raises `NotBuilt` where hardly any specimen of the ranges fits.
         """
@@ -195,7 +183,8 @@ class Plan:
         )
         beyond = _BEYOND * (high - low)
         sobol = qmc.Sobol(7, scramble=True, rng=np.random.default_rng(self.seed))
-        number = 0
+        tissues = self._tissues(low[2:] - beyond[2:], high[2:] + beyond[2:])
+        number, until, missed, shared = 0, 0, 0, np.empty(2)
         for drawn in count(0, 64):
             if drawn > _RAREST * (number + 4):
                 raise NotBuilt(
@@ -205,14 +194,24 @@ class Plan:
             drawings = sobol.random(64)
             specimens = low - beyond + drawings[:, :4] * (high - low + 2 * beyond)
             offsets = np.sort(drawings[:, 4:6])[:, ::-1] * r.offset_mm * (1 + _BEYOND)
-            fit = clearance(*specimens[:, :3].T) >= 0
-            fit &= offsets[:, 0] + specimens[:, 0] / 2 < self.width_mm / 2
-            for u, specimen, (x, y) in zip(drawings[fit], specimens[fit], offsets[fit], strict=True):
-                size, depth, thickness, tissue = specimen
+            for u, (size, depth, *rest), (x, y) in zip(drawings, specimens, offsets, strict=True):
+                if number == until or missed > _MISSED:
+                    shared, missed, until = next(tissues), 0, (number // self.shared + 1) * self.shared
+                thickness, tissue = rest if self.shared == 1 else shared
+                if clearance(size, depth, thickness) < 0 or x + size / 2 >= self.width_mm / 2:
+                    missed += 1
+                    continue
+                missed = 0
                 s = self.signals[0] + u[6] * (self.signals[1] - self.signals[0])
                 keep_x, keep_y = _OFFSETS[number % len(_OFFSETS)]
                 yield np.array([size, depth, keep_x * x, keep_y * y, thickness, tissue, s])
                 number += 1
+
+    def _tissues(self, low: Floats, high: Floats) -> Iterator[Floats]:
+        """Scrambled Sobol sequence of thickness and tissue, for specimens that share them."""
+        sobol = qmc.Sobol(2, scramble=True, rng=np.random.default_rng([self.seed, 1]))
+        while True:
+            yield from low + sobol.random(64) * (high - low)
 
     def inside(self, points: Floats) -> NDArray[np.bool_]:
         """Which of the points (n, 7) lie within the ranges, (n,)."""
@@ -244,145 +243,3 @@ PLAN: TypeAdapter[Plan] = TypeAdapter(Plan)
 def clearance(size: Some, depth: Some, thickness: Some) -> Some:
     """Room left between an inclusion and the chest wall, less what an emulator wants there, mm."""
     return thickness - CLEARANCE - size - depth
-
-
-def geometry_at(plan: Plan, point: Floats, modulus: float) -> Geometry:
-    """Geometry of a point of the plan, with an inclusion of a modulus, kPa."""
-    size, depth, x, y, thickness, tissue = (float(v) for v in point[:6])
-    slab = plan.slab(thickness, tissue)
-    inclusion = Inclusion(size, depth, modulus, (x, y), plan.inner_poisson)
-    check(plan.probe, slab, inclusion)
-    return Geometry(plan.probe, slab, inclusion)
-
-
-def solve(plan: Plan, point: Floats) -> dict[str, Floats]:
-    """Solve one point for all moduli at small strain.
-
-    Returns
-    -------
-    `rise` (moduli, n, n): pressure over the same without inclusion, in units of the latter; `moved` (moduli,
-    n, n, 3): tared displacement per mm of indentation.
-    """
-    if plan.degree:
-        return _expanded(plan, point, plan.ratios, plan.resolution)
-    geometries = [geometry_at(plan, point, float(r * point[5])) for r in plan.ratios]
-    with one_thread():
-        model = build(geometries[0], plan.resolution, False)
-        bare = path(geometries[0], model, False)
-        found = [tared_at_rest(g, path(g, model, True, bare), bare) for g in geometries]
-    return {name: np.stack([f[k] for f in found]) for k, name in enumerate(("rise", "moved"))}
-
-
-def refine(plan: Plan, point: Floats) -> dict[str, Floats]:
-    """What the finer mesh adds under the probe's middle, where symmetry makes it cheap.
-
-    Returns
-    -------
-    `rise` (moduli, k, k) and `moved` (moduli, k, k, 3) as of `solve`, at the fine mesh's nodes, less what is
-    carried there from the lean one's: what cubic splines through so few nodes are off by, three times what
-    the solves are, is in it.
-    """
-    point = _centred(point)
-    if plan.degree:  # these are fine as they are
-        n = len(logical_lines(plan.fine))
-        return {"rise": np.zeros((len(plan.ratios), n, n)), "moved": np.zeros((len(plan.ratios), n, n, 3))}
-    meshes = plan.resolution, plan.fine
-    return _gain(plan, point, meshes, [solve(replace(plan, resolution=res), point) for res in meshes])
-
-
-def stretch(plan: Plan, point: Floats) -> dict[str, Floats]:
-    """What finite strain adds on the coarse mesh, for the point's own s, to small strain.
-
-    Returns
-    -------
-    `rise` (levels, k, k) and `moved` (levels, k, k, 3) as of `solve`, finite minus small strain, for the
-    levels but 0.
-
-    Raises
-    ------
-    NotConverged, NotModelled
-        If no equilibrium is found at one of the levels, or only one whose contact has wrinkled.
-    """
-    ratio = (1 + 1.5 * point[6]) / (1 - point[6])
-    geometry, res = geometry_at(plan, point, float(ratio * point[5])), plan.coarse
-    with one_thread():
-        model = build(geometry, res, True)
-        bare = path(geometry, model, False)
-        full = path(geometry, model, True, bare)
-        small = tared_at_rest(geometry, full, bare)
-        found = [tared(geometry, (full.to(level), bare.to(level))) for level in plan.levels[1:].tolist()]
-    for level, (rise, _) in zip(plan.levels[1:].tolist(), found, strict=True):
-        refuse_wrinkles(rise, small[0], level)
-    whole, true = [np.stack([f[k] for f in found]) for k in range(2)], small
-    if plan.degree:
-        smooth = _expanded(plan, point, np.array([ratio]), res)
-        true = smooth["rise"][0], smooth["moved"][0]
-        x = lines(geometry, res)
-        whole = [without_ripples(*fields, x) for fields in zip(whole, small, true, strict=True)]
-    return {name: whole[k] - true[k] for k, name in enumerate(("rise", "moved"))}
-
-
-def refine_stretch(plan: Plan, point: Floats) -> dict[str, Floats]:
-    """What the fine mesh adds to what finite strain adds, as `refine` says it.
-
-    Returns
-    -------
-    `rise` (levels, k, k) and `moved` (levels, k, k, 3) as of `stretch`, at the fine mesh's nodes.
-    """
-    point = _centred(point)
-    meshes = plan.coarse, plan.fine
-    return _gain(plan, point, meshes, [stretch(replace(plan, coarse=res), point) for res in meshes])
-
-
-def _expanded(plan: Plan, point: Floats, ratios: Floats, res: Resolution) -> dict[str, Floats]:
-    """`solve` by multipoles, for inclusions of so many times the tissue's modulus, at the nodes of a mesh."""
-    geometry = geometry_at(plan, point, 1.0)
-    moduli = [float(ratio * point[5]) for ratio in ratios]
-    assert geometry.inclusion is not None
-    rise, moved = expanded(
-        plan.probe, geometry.slab, geometry.inclusion, moduli, plan.degree, lines(geometry, res)
-    )
-    return {"rise": rise, "moved": moved}
-
-
-def _centred(point: Floats) -> Floats:
-    return np.array([*point[:2], 0.0, 0.0, *point[4:]])
-
-
-def _gain(
-    plan: Plan, point: Floats, meshes: tuple[Resolution, Resolution], found: list[dict[str, Floats]]
-) -> dict[str, Floats]:
-    """Fields of the second mesh at its nodes, less those of the first one carried there."""
-    geometry = geometry_at(plan, point, 1.0)
-    nodes = [lines(geometry, res)[0] for res in meshes]
-    onto, (less, more) = cubic(*nodes), found
-
-    def gain(name: str) -> Floats:
-        carried = np.einsum("ai,cij...,bj->cab...", onto, less[name], onto, optimize=True)
-        return np.asarray(more[name] - carried)
-
-    return {name: gain(name) for name in ("rise", "moved")}
-
-
-def background(plan: Plan, thickness: float, tissue: float) -> dict[str, Floats]:
-    """Press on plain tissue, on the grid that answers are given on.
-
-    Returns
-    -------
-    Lines `x` (m,); `pressure` (levels, m, m) per kPa of the tissue and mm of indentation; `moved` (levels, m,
-    m, 3), displacement per mm of indentation.
-    """
-    geometry, levels = (
-        bare_geometry(plan.probe, plan.slab(thickness, tissue)),
-        tuple(plan.levels[1:].tolist()),
-    )
-    found = [(1.0, *ground(geometry, plan.fine, False, (1.0,)))]
-    if plan.finite:
-        found += zip(levels, ground(geometry, plan.fine, True, levels), strict=True)
-    x = grid_lines(found[0][1])[0]
-    pressure, moved = (
-        np.stack([np.asarray(surface[name], dtype=float) / level for level, surface in found])
-        for name in ("pressure", "displacement")
-    )
-    shape = (len(found), x.size, x.size)
-    return {"x": x, "pressure": pressure.reshape(shape) / tissue, "moved": moved.reshape(*shape, 3)}

@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fem.model import NotConverged, NotModelled
-from fem.sampling import PLAN, NotBuilt, Plan, background, refine, refine_stretch, solve, stretch
+from fem.sampling import PLAN, NotBuilt, Plan
+from fem.specimen import background, refine, refine_stretch, solve, stretch
 
 Floats = NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -29,9 +30,8 @@ _DEAD = (
     "workers: received one that ended by itself, killed or out of memory; allowed are as many as the memory "
     "holds (what is solved is kept: the same call goes on)"
 )
-_FORMAT = 9  # of a folder: its files, and the mechanics they are solved by (9: wrinkled presses are gaps)
-_SHARE = 8  # samples for each pair of a fine and a lean or coarse mesh
-STRETCHED = 3  # samples for each one at finite strain, which is the same specimen as an earlier one
+_FORMAT = 10  # of a folder: its files, and the mechanics they are solved by (10: points share tissues)
+_SHARE = {"pair": 8, "stretched_pair": 24}  # samples for each pair of a fine and a lean or coarse mesh
 _FIRST = 16  # pairs of each kind that come with one sample each
 KNOTS = (4, 4)  # Chebyshev nodes of the background along thickness and tissue: 0.01 % off between them
 
@@ -78,11 +78,12 @@ def run(
     done, running = 0, set[Future[None]]()
     with ProcessPoolExecutor(workers, context, initializer=_alone) as pool:
         try:
-            for kind, number in listed or _tasks(plan, folder, samples):
+            for kind, numbers in listed or _tasks(plan, folder, samples):
                 spent = time.monotonic() - start
                 if seconds is not None and spent > seconds and kind != "background":
                     break
-                running.add(pool.submit(_work, PLAN.dump_json(plan), str(folder), kind, number))
+                end = None if seconds is None else time.time() + seconds - spent
+                running.add(pool.submit(_work, PLAN.dump_json(plan), str(folder), kind, numbers, end))
                 if len(running) > workers:
                     ready, running = wait(running, return_when=FIRST_COMPLETED)
                     done += len(ready)
@@ -90,7 +91,7 @@ def run(
                         future.result()
                 by_time = 0.0 if seconds is None else spent / seconds
                 by_count = 0.0 if listed is None else done / len(listed)
-                progress(f"{kind} {number + 1}", min(1.0, max(by_time, by_count)))
+                progress(f"{kind} {numbers[-1] + 1}", min(1.0, max(by_time, by_count)))
             for future in running:
                 future.result()
         except BaseException as error:
@@ -120,25 +121,38 @@ def claim(plan: Plan, folder: Path) -> None:
         _write(place, json.dumps(head, indent=1).encode())
 
 
-def _tasks(plan: Plan, folder: Path, samples: int | None) -> Iterator[tuple[str, int]]:
-    """What is still to solve, in order; pairs are spread evenly among the samples."""
+def _tasks(plan: Plan, folder: Path, samples: int | None) -> Iterator[tuple[str, list[int]]]:
+    """What is still to solve, in order: kind and numbers, those of samples that share a tissue together;
+    pairs are spread evenly among them."""
 
-    def order() -> Iterator[tuple[str, int]]:
+    def order() -> Iterator[tuple[str, list[int]]]:
         pairs = dict.fromkeys(("pair", "stretched_pair") if plan.finite else ("pair",), 0)
         for number in range(KNOTS[0] * KNOTS[1]):
-            yield "background", number
-        for number in count() if samples is None else range(samples):
-            for kind in pairs:
-                while pairs[kind] <= max(min(number, _FIRST - 1), number // _SHARE):
-                    yield kind, pairs[kind]
+            yield "background", [number]
+        for first in count(0, plan.shared):
+            numbers = range(
+                first, first + plan.shared if samples is None else min(first + plan.shared, samples)
+            )
+            if not numbers:
+                return
+            for kind, share in _SHARE.items():
+                while kind in pairs and pairs[kind] <= max(min(first, _FIRST - 1), first // share):
+                    yield kind, [pairs[kind]]
                     pairs[kind] += 1
-            yield "sample", number
-            if plan.finite and number % STRETCHED == 0:
-                yield "stretch", number // STRETCHED
+            yield "sample", list(numbers)
 
-    for kind, number in order():
-        if not file_of(folder, kind, number).exists():
-            yield kind, number
+    for kind, numbers in order():
+        left = [
+            n for n in numbers if any(not file_of(folder, *one).exists() for one in _solves(plan, kind, n))
+        ]
+        if left:
+            yield kind, left
+
+
+def _solves(plan: Plan, kind: str, number: int) -> list[tuple[str, int]]:
+    """The solves of a task's number: some samples are solved at finite strain, too."""
+    more = kind == "sample" and plan.finite and plan.stretched(number)
+    return [(kind, number), ("stretch", number)] if more else [(kind, number)]
 
 
 def _alone() -> None:
@@ -159,8 +173,18 @@ _UNSOLVED = (NotConverged, NotModelled, ArithmeticError, np.linalg.LinAlgError)
 _SOLVES = {"sample": solve, "pair": refine, "stretch": stretch, "stretched_pair": refine_stretch}
 
 
-def _work(plan_json: bytes, folder: str, kind: str, number: int) -> None:
+def _work(plan_json: bytes, folder: str, kind: str, numbers: list[int], end: float | None) -> None:
+    """Solve and keep what is not kept yet; samples until the time `end`."""
     plan = PLAN.validate_json(plan_json)
+    for number in numbers:
+        for one in _solves(plan, kind, number):
+            if kind == "sample" and end is not None and time.time() > end:
+                return
+            if not file_of(Path(folder), *one).exists():
+                _solve(plan, Path(folder), *one)
+
+
+def _solve(plan: Plan, folder: Path, kind: str, number: int) -> None:
     start = time.process_time()
     if kind == "background":
         thick, tissue = knots(plan)
@@ -175,14 +199,14 @@ def _work(plan_json: bytes, folder: str, kind: str, number: int) -> None:
                 "that can, or small strain"
             ) from None
     else:
-        point = plan.point(number)
+        point = plan.point(number * plan.shared if kind.endswith("pair") else number)
         try:
             found = _SOLVES[kind](plan, point)
         except _UNSOLVED:
             found = {}  # kept as a gap, so that a build that goes on does not try it again
         found["point"] = point
     found["seconds"] = np.array(time.process_time() - start)
-    place = file_of(Path(folder), kind, number)
+    place = file_of(folder, kind, number)
     rough = place.with_name(f".{place.name}.{os.getpid()}")
     with open(rough, "wb") as stream:
         kept = {name: np.asarray(value, np.float64) for name, value in found.items()}

@@ -32,26 +32,35 @@ _SILENT = 1e-10  # mm / mm: a tared displacement that is rounding
 _GRID = 61  # places along each axis at which the fields are compared
 
 
-def discretisation_error(geometry: Geometry, res: Resolution, full: Path, bare: Path) -> float:
+def on_coarser(geometry: Geometry, res: Resolution) -> Floats | None:
+    """`tared` on the mesh that is coarser than a quality's; None where there is nothing to tare.
+
+    Before the quality's own mesh is made: beside its factor, memory is dear.
+    """
+    if geometry.inclusion is None:
+        return None
+    model = build(geometry, COARSER[res], False)
+    bare = path(geometry, model, False)
+    return tared(geometry, path(geometry, model, True, bare), bare)
+
+
+def discretisation_error(geometry: Geometry, coarse: Floats | None, full: Path, bare: Path) -> float:
     """Estimate the error of the tared displacement, in per cent of its maximum; 0 where there is no
     signal: without inclusion, or with one of the tissue's own moduli.
 
     Parameters
     ----------
-    res
-        That of a quality.
+    coarse
+        From `on_coarser`.
     full, bare
         Paths with and without inclusion on the mesh in question.
     """
-    if geometry.inclusion is None:
+    if coarse is None:
         return 0.0
     fine = tared(geometry, full, bare)
     largest = np.abs(fine).max()
     if largest < _SILENT:
         return 0.0
-    model = build(geometry, COARSER[res], False)
-    bare = path(geometry, model, False)
-    coarse = tared(geometry, path(geometry, model, True, bare), bare)
     return float(100 * SHARE * np.abs(fine - coarse).max() / largest)
 
 

@@ -26,6 +26,8 @@ SLAB = fem.Slab(30, 60, 5)
 # the tared maximum of a linear press by 0.2 %.
 COARSE_EDGE = Resolution(arc=3, core=1, shell=3, above=3, below=2, edge=2, side=2, layer=2, backing=1)
 GRADED_EDGE = replace(COARSE_EDGE, edge=3, growth=(0.5, 1.6))
+# What its totals and its force at finite strain need besides: at 3 mm they come nearer by 1.2 and 0.7 %.
+COARSE_EDGE_ALONE = replace(COARSE_EDGE, above=4, side=3, backing=2)
 # Its totals of a linear press need fine ones.
 FINE_EDGE = Resolution(4, 1, 4, 3, 2, edge=3, side=4, layer=3, backing=1, growth=(1 / 1.7, 2.2))
 # On those its force under an inclusion off the middle is 0.3 % higher than on these.
@@ -106,7 +108,7 @@ def test_linear(tmp_path: Path, inclusion: fem.Inclusion) -> None:
 
 @needs_ccx
 @pytest.mark.slow
-@pytest.mark.timeout(3000)
+@pytest.mark.timeout(7200)
 @pytest.mark.parametrize(
     "level",
     [
@@ -128,12 +130,9 @@ def test_finite(tmp_path: Path, inclusion: fem.Inclusion, level: float) -> None:
     row, where one of its cells is as wide as the edge's rise."""
     geometry = Geometry(PROBE, SLAB, inclusion)
     ours = fem.press(PROBE, SLAB, inclusion, [level], estimate=False)
-    theirs = ccx_runner.press_slid(tmp_path, geometry, level, COARSE_EDGE)
+    theirs = ccx_runner.press_slid(tmp_path, geometry, level, COARSE_EDGE_ALONE)
     ((top, _, force, inner),) = differences([level], ours, [theirs])
-    assert abs(top) < 0.02 and abs(force) < 0.02
-    assert abs(inner) < 0.03
-    if abs(inner) >= 0.02:
-        pytest.xfail(f"total without the outermost row {inner:+.1%} apart, goal 2 %")
+    assert abs(top) < 0.02 and abs(force) < 0.02 and abs(inner) < 0.02
 
 
 @needs_ccx

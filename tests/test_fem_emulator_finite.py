@@ -15,8 +15,9 @@ from fem.emulator_errors import off_the_edge
 from fem.emulator_file import NotAnEmulator, load_emulator, save_emulator
 from fem.mesh import Geometry
 from fem.pressing import _presses
-from fem.sampling import Plan, contrast, geometry_at, solve, stretch
+from fem.sampling import Plan, contrast
 from fem.solving import file_of, solved, tally
+from fem.specimen import geometry_at, solve, stretch
 
 FINITE = replace(PLAN, mechanics="finite", coarse=COARSE, fine=FINER)
 SAMPLES = 40

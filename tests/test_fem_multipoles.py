@@ -234,7 +234,8 @@ def test_plain_tissue_is_fine_enough(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, fineness in (("finest", finest), *QUALITIES.items()):
         monkeypatch.setitem(QUALITIES, name, fineness)
         some = (fem.Inclusion(size, depth, e, offset=(aside, 0)) for size, depth, e, aside in balls)
-        rises = [expanded(PROBE, SLAB, ball, [ball.modulus], DEGREE, (at, at), name)[0][0] for ball in some]
+        tissue = fem.multipoles(PROBE, SLAB, name, degree=DEGREE)
+        rises = [expanded(tissue, ball, [ball.modulus], (at, at))[0][0] for ball in some]
         found[name] = np.stack(rises)
     top = found["finest"].max(axis=(1, 2))
     for name, limits in (("preview", (0.8, 4.5)), ("standard", (0.13, 0.85))):

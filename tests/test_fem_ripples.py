@@ -11,7 +11,7 @@ from test_fem_multipoles import PROBE, SLAB
 
 import fem
 import twin
-from fem import mesh, sampling
+from fem import mesh, sampling, specimen
 from fem.emulator import lagrange
 from fem.ground import carry, cubic
 from fem.ground import lines as lines_of
@@ -50,16 +50,16 @@ def test_solves_of_a_plan_are_multipoles_at_its_nodes() -> None:
     """For all its moduli; nothing is left to a finer mesh."""
     plan = plan_of(twin.load_design("tsis"))
     point = np.array([10.0, 5.0, 0.0, 0.0, 30.0, 5.0, 0.8])
-    found = sampling.solve(plan, point)
+    found = specimen.solve(plan, point)
     modulus = float(plan.ratios[1] * 5.0)
     slab = plan.slab(30.0, 5.0)
     tissue = fem.multipoles(plan.probe, slab, degree=8)
     (press,) = tissue.press(fem.Inclusion(10.0, 5.0, modulus), [1.0])
     data = press.surface.point_data
     rise = np.asarray(data["pressure"]) / data["pressure_0"] - 1.0
-    to = lines(sampling.geometry_at(plan, point, 50.0), plan.resolution)
+    to = lines(specimen.geometry_at(plan, point, 50.0), plan.resolution)
     np.testing.assert_allclose(found["rise"][1].ravel(), carry(rise, lines_of(press.surface), to), atol=1e-9)
-    assert not sampling.refine(plan, point)["rise"].any()
+    assert not specimen.refine(plan, point)["rise"].any()
 
 
 @pytest.mark.slow
@@ -77,7 +77,8 @@ def test_meshes_that_follow_the_inclusion_come_nearer_as_they_are_refined() -> N
         own = lines_of(press)
         plain = np.asarray(press["pressure_0"]).reshape(own[0].size, own[1].size)
         tared = np.asarray(press["pressure"]).reshape(plain.shape) - plain
-        true = expanded(PROBE, SLAB, ball, [ball.modulus], 8, own)[0][0] * plain
+        tissue = fem.multipoles(PROBE, SLAB, degree=8)
+        true = expanded(tissue, ball, [ball.modulus], own)[0][0] * plain
         inner = np.logical_and.outer(*(np.abs(line) < 10.0 for line in own))
         rms = np.sqrt(np.mean((tared - true)[inner] ** 2)) / true.max()
         off[name] = 100 * rms, 100 * (tared.max() / true.max() - 1)
@@ -94,7 +95,7 @@ def test_meshes_agree_at_finite_strain_once_ripples_are_out(ball: tuple[float, f
     """A lean mesh against one of standard quality, at 1, 2 and 3 mm: five times as near, off the edge."""
     plan = plan_of(twin.load_design("tsis"))
     point = np.array([*ball, 0.0, 0.0, 30.0, 5.0, 0.9])
-    geometry = sampling.geometry_at(plan, point, 1.0)
+    geometry = specimen.geometry_at(plan, point, 1.0)
     to, size = lines(geometry, sampling.FINE)[0], {}
     for degree in (0, plan.degree):
         found = []
@@ -102,11 +103,11 @@ def test_meshes_agree_at_finite_strain_once_ripples_are_out(ball: tuple[float, f
             some = replace(plan, degree=degree, coarse=res, resolution=sampling.STORED if degree else res)
             own = lines(geometry, res)[0], lines(geometry, some.resolution)[0]
             onto = [cubic(line, to) for line in own]
-            small = sampling.solve(some, point)["rise"]
+            small = specimen.solve(some, point)["rise"]
             along = sampling.contrast(plan.ratios), point[6]
             weights = lagrange(*along)
             small = np.tensordot(weights, small, 1)
-            more = sampling.stretch(some, point)["rise"]
+            more = specimen.stretch(some, point)["rise"]
             whole = np.einsum("ai,cij,bj->cab", onto[0], more, onto[0]) + onto[1] @ small @ onto[1].T
             found.append(whole[:, 3:-3, 3:-3])
         away = np.sqrt(((found[0] - found[1]) ** 2).mean(axis=(1, 2))) / np.abs(found[1]).max(axis=(1, 2))

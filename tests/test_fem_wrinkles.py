@@ -7,7 +7,7 @@ import pytest
 
 import twin
 from fem.model import NotConverged
-from fem.sampling import stretch
+from fem.specimen import stretch
 from fem.wrinkles import refuse_wrinkles, wrinkle
 from twin.emulate import plan_of
 

@@ -14,7 +14,7 @@ import twin
 from fem.emulator import Emulator
 from fem.emulator_errors import Errors
 from fem.lines import lines, logical_lines
-from fem.regression import Regression
+from fem.regression import MATERN, Regression
 from fem.solving import KNOTS
 from fem.topology import Resolution
 from twin import presses
@@ -39,6 +39,7 @@ def constant(values: np.ndarray, inputs: int) -> Regression:
         modes=np.zeros((1, len(flat))),
         trend=np.zeros((inputs + 1, 1)),
         weights=np.zeros((1, 1)),
+        order=np.array(MATERN),
     )
 
 
@@ -193,7 +194,7 @@ def test_the_command_finds_the_designs_own_emulator(
 
 def test_lines_of_the_mesh_span_the_probe():
     """The made-up emulators' fields lie on the nodes of a real mesh."""
-    from fem.sampling import geometry_at
+    from fem.specimen import geometry_at
 
     plan = invented().plan
     along = lines(geometry_at(plan, np.array([9.0, 5.0, 2.0, 1.0, 30.0, 5.0, 0.5]), 80.0), TINY)

@@ -12,7 +12,7 @@ import fem
 from fem.emulating import build_emulator, fit
 from fem.emulator import Emulator
 from fem.ground import cubic, lines
-from fem.sampling import geometry_at
+from fem.specimen import geometry_at
 from fem.surface import line_weights
 from twin import load_design
 from twin.emulate import plan_of
