@@ -318,7 +318,7 @@ def _presses(
     first = geometries[0]
     try:
         with one_thread():
-            coarse = [on_coarser(g, res) if estimate else None for g in geometries]
+            coarse = on_coarser(geometries, res) if estimate else [None] * len(geometries)
             model = build(first, res, mechanics == "finite")
             bare = path(first, model, False)
             step("without inclusion")

@@ -5,9 +5,8 @@ a linear trend and Matérn's covariances of order 5/2 (Rasmussen and Williams 20
 5.4.1, equation 4.17; [rasmussen2006]). Leading modes have lengths of their own, the others share some; they
 maximise the marginal likelihood, the trend and each mode's variance are solved for.
 
-Squared exponentials, which emulators of earlier versions have, take contact pressures for smoother than they
-are: left out in turn, 20 presses at finite strain were off by 1.25 and 3.9 % (median and 95th percentile of
-the largest error), for 0.93 and 2.0 %.
+Squared exponentials, which emulators of earlier versions have, take contact pressures for smoother
+than they are.
 """
 
 from __future__ import annotations

@@ -143,13 +143,13 @@ def _tasks(plan: Plan, folder: Path, samples: int | None) -> Iterator[tuple[str,
 
     for kind, numbers in order():
         left = [
-            n for n in numbers if any(not file_of(folder, *one).exists() for one in _solves(plan, kind, n))
+            n for n in numbers if any(not file_of(folder, *one).exists() for one in _asked(plan, kind, n))
         ]
         if left:
             yield kind, left
 
 
-def _solves(plan: Plan, kind: str, number: int) -> list[tuple[str, int]]:
+def _asked(plan: Plan, kind: str, number: int) -> list[tuple[str, int]]:
     """The solves of a task's number: some samples are solved at finite strain, too."""
     more = kind == "sample" and plan.finite and plan.stretched(number)
     return [(kind, number), ("stretch", number)] if more else [(kind, number)]
@@ -177,7 +177,7 @@ def _work(plan_json: bytes, folder: str, kind: str, numbers: list[int], end: flo
     """Solve and keep what is not kept yet; samples until the time `end`."""
     plan = PLAN.validate_json(plan_json)
     for number in numbers:
-        for one in _solves(plan, kind, number):
+        for one in _asked(plan, kind, number):
             if kind == "sample" and end is not None and time.time() > end:
                 return
             if not file_of(Path(folder), *one).exists():

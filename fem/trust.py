@@ -8,6 +8,8 @@ and a fixed share of it the finer one's (`SHARE`, measured; `tests/test_fem_trus
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,16 +34,17 @@ _SILENT = 1e-10  # mm / mm: a tared displacement that is rounding
 _GRID = 61  # places along each axis at which the fields are compared
 
 
-def on_coarser(geometry: Geometry, res: Resolution) -> Floats | None:
-    """`tared` on the mesh that is coarser than a quality's; None where there is nothing to tare.
+def on_coarser(geometries: Sequence[Geometry], res: Resolution) -> list[Floats | None]:
+    """`tared` of geometries that differ in the inclusion's modulus only, on the mesh that is coarser than a
+    quality's; None where there is nothing to tare.
 
     Before the quality's own mesh is made: beside its factor, memory is dear.
     """
-    if geometry.inclusion is None:
-        return None
-    model = build(geometry, COARSER[res], False)
-    bare = path(geometry, model, False)
-    return tared(geometry, path(geometry, model, True, bare), bare)
+    if geometries[0].inclusion is None:
+        return [None] * len(geometries)
+    model = build(geometries[0], COARSER[res], False)
+    bare = path(geometries[0], model, False)
+    return [tared(one, path(one, model, True, bare), bare) for one in geometries]
 
 
 def discretisation_error(geometry: Geometry, coarse: Floats | None, full: Path, bare: Path) -> float:
@@ -51,7 +54,7 @@ def discretisation_error(geometry: Geometry, coarse: Floats | None, full: Path, 
     Parameters
     ----------
     coarse
-        From `on_coarser`.
+        One of `on_coarser`.
     full, bare
         Paths with and without inclusion on the mesh in question.
     """

@@ -34,7 +34,7 @@ def test_estimate_is_near_the_true_error(size: float, depth: float) -> None:
     for quality in ("preview", "standard"):
         found = pair(geometry, QUALITIES[quality])
         true = 100 * np.abs(tared(geometry, *found) - exact).max() / np.abs(exact).max()
-        coarse = on_coarser(geometry, QUALITIES[quality])
+        (coarse,) = on_coarser([geometry], QUALITIES[quality])
         ratios[quality] = discretisation_error(geometry, coarse, *found) / true
         print(f"size {size} depth {depth} {quality}: true {true:.3f} %, ratio {ratios[quality]:.2f}")
     assert all(0.5 < ratio < 3 for ratio in ratios.values())
@@ -53,3 +53,14 @@ def test_an_inclusion_of_tissue_has_no_error() -> None:
     same = fem.Inclusion(10, 5, SLAB.modulus_kPa, poisson=SLAB.poisson)
     answer = fem.press(PROBE, SLAB, same, 1.0, mechanics="linear", quality="preview")
     assert answer.error_percent == 0
+
+
+def test_moduli_are_estimated_together_as_alone() -> None:
+    """They share the coarser mesh and its press without inclusion."""
+    ball, moduli = fem.Inclusion(9, 5, 60), (30.0, 90.0)
+    together = fem.press_moduli(PROBE, SLAB, ball, moduli, [1.0], mechanics="linear", quality="preview")
+    for modulus, (press,) in zip(moduli, together, strict=True):
+        alone = fem.press(
+            PROBE, SLAB, fem.Inclusion(9, 5, modulus), 1.0, mechanics="linear", quality="preview"
+        )
+        assert press.error_percent == pytest.approx(alone.error_percent, rel=1e-6) and press.error_percent > 0
